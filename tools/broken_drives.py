@@ -23,9 +23,10 @@ from slam.geometry.se3 import FloatArray, umeyama
 from slam.results.metrics import SequenceMetrics
 from slam.runtime.errors import SlamError
 from slam.runtime.storage.record import Missing, known
-from slam.sequences.simulated import FPS, SimulatedSequence
+from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_calibration, write_image, write_lines, write_poses
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import STREET_RATE as FPS
+from slam.simulation.options import SimulationOptions
 
 Image = NDArray[np.uint8]
 FRAMES, SEED, OTHER_SEED = 300, 1400, 1401

@@ -81,28 +81,44 @@ app.add_typer(localisation_verbs)
 @app.command()
 def simulate(
     output: Annotated[Path, typer.Argument(help="the root to write")],
-    route: Annotated[str, typer.Option(help="loop, grid or straight")] = "loop",
-    frames: Annotated[int, typer.Option(help="10 frames a second, about 1 m apart; a loop needs 250 or more")] = 300,
+    route: Annotated[str, typer.Option(help="loop, grid or straight streets, or rooms")] = "loop",
+    frames: Annotated[int, typer.Option(help="about 1 m apart on a street; a loop needs 250 or more")] = 300,
     seed: Seed = 0,
     width: Annotated[int, typer.Option(help="pixels")] = 416,
     height: Annotated[int, typer.Option(help="pixels")] = 128,
     lidar: Annotated[bool, typer.Option("--lidar", help="write 64-beam scans")] = False,
     depth: Annotated[bool, typer.Option("--depth", help="write exact depth maps")] = False,
-    hazards: Annotated[str, typer.Option(help="comma list of moving-cars, exposure, blur, stop, rain")] = "",
+    mesh: Annotated[bool, typer.Option("--mesh", help="write the true surface, mesh.ply")] = False,
+    hazards: Annotated[
+        str,
+        typer.Option(
+            help="comma list of moving-cars, exposure, blur, stop, rain; "
+            "of rooms people, exposure, blur, rolling-shutter, stop"
+        ),
+    ] = "",
     varied: Annotated[
-        bool, typer.Option("--varied", help="another camera than KITTI's, railings, people, cars that overtake")
+        bool,
+        typer.Option(
+            "--varied", help="another camera than KITTI's, railings, people, cars that overtake; of rooms another lens"
+        ),
     ] = False,
+    motion: Annotated[
+        str | None, typer.Option(help="how the camera goes through rooms: walk, look, phone, drone or robot")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="frames a second, of rooms 5 to 60")] = 10.0,
     device: UnusedDevice = "auto",
 ) -> None:
-    """A simulated street as a KITTI odometry root. Its ground truth is exact.
+    """A simulated street, or simulated rooms, as a KITTI odometry root. Its ground truth is exact.
 
     Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
     """
-    from slam.simulation.street import SimulatedStreet, parse_options, write_kitti_root
+    from slam.simulation.kitti_layout import write_kitti_root
+    from slam.simulation.options import parse_options
+    from slam.simulation.worlds import simulated_world
 
-    street = SimulatedStreet(parse_options(route, frames, seed, width, height, hazards, varied))
+    world = simulated_world(parse_options(route, frames, seed, width, height, hazards, varied, motion, rate))
     with progress_bar() as progress:
-        write_kitti_root(street, output, depth, lidar, lambda done: progress("frames", done, frames))
+        write_kitti_root(world, output, depth, lidar, lambda done: progress("frames", done, frames), mesh)
     typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")
 
 

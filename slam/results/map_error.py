@@ -49,12 +49,11 @@ class DepthTruth:
         self._is_part = first > 0
         frames = np.asarray(depth.true_depth_frames(), dtype=np.int64) - start
         self.frames: Indices = frames[(frames >= first) & (frames < len(sequence))]
-        street = getattr(depth, "street", None)
-        self.name = "depth maps" if street is None else "exact surface"
+        exact, T_any_camera = getattr(depth, "distance_to_surface", None), getattr(depth, "T_any_camera", None)
+        self.name = "depth maps" if exact is None else "exact surface"
         self.distance: Callable[[FloatArray], FloatArray] | None = None
-        if street is not None:
-            T_street_first = street.T_world_camera[start]
-            self.distance = lambda points: np.asarray(street.distance_to_surface(apply(T_street_first, points)))
+        if exact is not None and T_any_camera is not None:
+            self.distance = lambda points: exact(apply(T_any_camera[start], points))
 
     def view(self, frame: int) -> Surface:
         """Surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m."""

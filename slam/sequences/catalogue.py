@@ -110,7 +110,7 @@ def sequence_names(dataset: Path) -> list[str]:
 def _open_embedded() -> SourcedSequence:
     # rendering needs Open3D, which is slow to import
     from slam.sequences.simulated import SimulatedSequence
-    from slam.simulation.street import SimulationOptions
+    from slam.simulation.options import SimulationOptions
 
     return SimulatedSequence(SimulationOptions(route="loop", frames=EMBEDDED_FRAMES, seed=EMBEDDED_SEED))
 

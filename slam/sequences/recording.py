@@ -78,7 +78,8 @@ class RecordedSequence:
     ``camera`` took the images as they are stored: where its lens is distorted they are undistorted as they are read,
     and ``depth_maps``, the true depth beside the stored images, are left out. ``usual_height_m`` is the height of a
     camera that does not say its own. ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown;
-    ``reference`` follows from them where all are known.
+    ``reference`` follows from them where all are known. ``distance_to_surface`` gives the distance of points ``(M, 3)``
+    of that world to the true surface, where the whole of it is known.
     """
 
     name: str
@@ -91,6 +92,7 @@ class RecordedSequence:
     T_camera_lidar: FloatArray | None = None
     scans: dict[int, ScanReader] = field(default_factory=dict)
     depth_maps: DepthMaps | None = None
+    distance_to_surface: Callable[[FloatArray], FloatArray] | None = None
     intrinsics: Intrinsics = field(init=False)
     camera_height_m: float | None = field(init=False)
     reference: FloatArray | None = field(default=None, init=False)

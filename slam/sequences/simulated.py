@@ -1,4 +1,4 @@
-"""The embedded sequence: a simulated street rendered in memory, with ground truth."""
+"""The embedded sequence: a simulated world rendered in memory, with ground truth."""
 
 from __future__ import annotations
 
@@ -9,31 +9,33 @@ import numpy as np
 from slam.frames import Image, Intrinsics
 from slam.geometry.se3 import FloatArray
 from slam.sequences.recording import RecordedSequence, Source, uniform_stamps
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.world import SimulatedWorld
+from slam.simulation.worlds import simulated_world
 
-FPS = 10.0
 _CACHED_FRAMES = 32
 
 
 class SimulatedSequence(RecordedSequence):
-    """A ``SimulatedStreet`` as a sequence; ``street`` has the depth, the scans and the true surface.
+    """A ``SimulatedWorld`` as a sequence; ``street`` has the depth, the scans and the true surface.
 
     ``reference`` is re-based to the first camera; ``street.T_world_camera[0]`` takes it to the street.
     """
 
     def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
-        self.street = SimulatedStreet(options)
+        self.street = simulated_world(options)
         K = np.asarray(self.street.K, dtype=np.float64)
         focal_and_centre = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         super().__init__(
             name,
             _Renderings(self.street),
             Intrinsics(options.width, options.height, *focal_and_centre),
-            uniform_stamps(options.frames, FPS),
+            uniform_stamps(options.frames, options.rate),
             (Source(f"simulated/{options.seed}", first=None),),
             T_any_camera=np.asarray(self.street.T_world_camera, dtype=np.float64),
-            usual_height_m=float(self.street.camera_height_m),
-            T_camera_lidar=np.asarray(self.street.T_camera_lidar, dtype=np.float64),
+            usual_height_m=self.street.camera_height_m,
+            T_camera_lidar=self.street.T_camera_lidar,
+            distance_to_surface=self.street.distance_to_surface,
         )
 
     def true_depth_frames(self) -> list[int]:
@@ -48,7 +50,7 @@ class SimulatedSequence(RecordedSequence):
 class _Renderings:
     """The images of a street; recent ones are kept in memory."""
 
-    def __init__(self, street: SimulatedStreet) -> None:
+    def __init__(self, street: SimulatedWorld) -> None:
         self.width, self.height = street.options.width, street.options.height
         self._frames = street.options.frames
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index).image)

@@ -33,6 +33,18 @@ class Material(IntEnum):
     GLASS = 13
     TYRE = 14
     FENCE = 15
+    PLASTER = 16
+    TILES = 17
+    BOARDS = 18
+    CARPET = 19
+    WOOD = 20
+    FABRIC = 21
+    BOOKS = 22
+    PICTURE = 23
+    SCREEN = 24
+    PANE = 25
+    CARTON = 26
+    LAMP = 27
 
 
 @dataclass(frozen=True)
@@ -196,6 +208,9 @@ class Bend:
         steps = np.arange(len(self.road)) + self.road_start
         centre_x, centre_y, heading = (np.interp(x, steps, self.road[:, i]) for i in range(3))
         return np.stack([centre_x - y * np.sin(heading), centre_y + y * np.cos(heading), z + hill], axis=-1)
+
+
+FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))  # the plan as it is
 
 
 def town_bend(rng: np.random.Generator) -> Bend:

@@ -1,6 +1,5 @@
 """Hazards of a simulated drive: moving cars, exposure jumps, motion blur, a stop, rain."""
 
-import dataclasses
 from typing import Literal
 
 import cv2
@@ -8,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
-from slam.simulation.geometry import Bend, Float32Array, FloatArray, Mesh, Soup
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Soup
+from slam.simulation.moving import Moving
 from slam.simulation.objects import car, frame_at
 from slam.simulation.route import STEP, Route
 
@@ -17,7 +17,6 @@ Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
 STILL_FRAMES = 30  # 3 s at 10 frames a second
 SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 BLUR_SAMPLES = 6
-_FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))
 
 
 def exposure_curve(seed: int, frames: int) -> FloatArray:
@@ -87,8 +86,7 @@ class Traffic:
         for _ in range(1 + len(self._starts) + len(self._passing)):
             firsts.append(soup.instances)
             car(soup, rng, frame_at(0.0, 0.0, 0.0))
-        self._mesh = soup.finish(_FLAT)
-        self._car_of_triangle = np.searchsorted(firsts, self._mesh.instance, side="right") - 1
+        self._cars = Moving(soup, firsts)
 
     def _plan_passing(self, rng: np.random.Generator) -> list[tuple[float, float, float]]:
         """Cars on the camera's left, and slower ones on its right, in the form of ``_starts``."""
@@ -106,40 +104,14 @@ class Traffic:
         camera = self._route.T_street_camera[index, :3, 3]
         T_street_cars = [self._leader(index), *(self._oncoming(start, index) for start in self._starts)]
         T_street_cars += [self._at(start + speed * index, left_m, 1.0) for start, speed, left_m in self._passing]
-        parts = []
+        near = {}
         for number, T_street_car in enumerate(T_street_cars):
             if T_street_car is None:
                 continue
             distance = float(np.linalg.norm(T_street_car[:3, 3] - camera))
             if 2.6 < distance < 120.0:  # nearer only where the drive crosses itself
-                parts.append(self._part(number, T_street_car))
-        if not parts:
-            return None
-        corners = np.concatenate([part.vertices for part in parts])
-        return dataclasses.replace(
-            self._mesh,
-            vertices=corners,
-            triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
-            uv=np.concatenate([part.uv for part in parts], axis=-1),
-            normals=np.concatenate([part.normals for part in parts], axis=-1),
-            tangents=np.concatenate([part.tangents for part in parts], axis=-1),
-            instance=np.concatenate([part.instance for part in parts]),
-            material=np.concatenate([part.material for part in parts]),
-        )
-
-    def _part(self, number: int, T_street_car: FloatArray) -> Mesh:
-        """One car's triangles, three vertices each, moved into the street."""
-        mine = self._car_of_triangle == number
-        R, t = T_street_car[:3, :3].astype(np.float32), T_street_car[:3, 3].astype(np.float32)
-        return dataclasses.replace(
-            self._mesh,
-            vertices=self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t,
-            uv=self._mesh.uv[..., mine],
-            normals=R @ self._mesh.normals[:, mine],
-            tangents=R @ self._mesh.tangents[:, mine],
-            instance=self._mesh.instance[mine],
-            material=self._mesh.material[mine],
-        )
+                near[number] = T_street_car
+        return self._cars.placed(near)
 
     def _leader(self, index: int) -> FloatArray | None:
         """A car in the camera's lane that keeps its distance, until it drives away."""

@@ -1,12 +1,98 @@
-"""The files of a simulated KITTI odometry root: images, depth maps, calibration and poses."""
+"""The files of a simulated KITTI odometry root: images, depth maps, scans, surfaces, calibration and poses."""
 
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Float32Array, FloatArray
+from slam.simulation.options import VERSION
+from slam.simulation.world import SimulatedWorld
+
+
+def write_kitti_root(
+    world: SimulatedWorld,
+    output: Path,
+    depth: bool = False,
+    lidar: bool = False,
+    progress: Callable[[int], None] | None = None,
+    mesh: bool = False,
+) -> None:
+    """Write a drive as the KITTI odometry root ``output`` with the one sequence ``sim``.
+
+    Args:
+        world: the drive.
+        output: a folder that does not exist yet or is empty.
+        depth: whether to write depth maps (16 bit, metres x 256, 0 where nothing was hit).
+        lidar: whether to write scans.
+        progress: called with the number of frames written so far.
+        mesh: whether to write all surfaces that stand still, as ``mesh.ply`` in the frame of the first camera.
+
+    Raises:
+        SequenceError: if ``output`` holds something already, or cannot be written; scans of a world without a LiDAR.
+    """
+    if lidar and world.T_camera_lidar is None:
+        raise SequenceError(f"no LiDAR is carried through {world.options.route}: leave --lidar out")
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise SequenceError(f"{output} is {'not empty' if output.is_dir() else 'a file'}; remove it or choose another")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
+        partial.chmod(0o755)
+        try:
+            _write_frames(world, partial / "sequences" / "sim", depth, lidar, progress)
+            _write_records(world, partial)
+            if mesh:
+                write_mesh(partial / "mesh.ply", *world.mesh_world())
+            partial.replace(output)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        raise SequenceError(f"cannot write the simulated sequence to {output}: {error}") from error
+
+
+def _write_frames(
+    world: SimulatedWorld,
+    folder: Path,
+    depth: bool,
+    lidar: bool,
+    progress: Callable[[int], None] | None,
+) -> None:
+    """Images, and depth maps and scans if wanted."""
+    wanted = {"image_2": True, "depth_2": depth, "velodyne": lidar}
+    for name in (name for name, is_wanted in wanted.items() if is_wanted):
+        (folder / name).mkdir(parents=True)
+    for index in range(len(world)):
+        frame = world.render(index)
+        write_image(folder / "image_2" / f"{index:06d}.png", frame.image)
+        if depth:
+            write_depth(folder / "depth_2" / f"{index:06d}.png", frame.depth)
+        if lidar:
+            world.scan(index).astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
+        if progress:
+            progress(index + 1)
+
+
+def _write_records(world: SimulatedWorld, root: Path) -> None:
+    """Calibration, times, poses, the camera and what was simulated."""
+    sequence, K, options = root / "sequences" / "sim", world.K, world.options
+    write_calibration(sequence / "calib.txt", K, world.T_camera_lidar)
+    write_lines(sequence / "times.txt", [f"{index / options.rate:.6e}" for index in range(len(world))])
+    (root / "poses").mkdir()
+    write_poses(root / "poses" / "sim.txt", world.T_world_camera)
+    camera = {"width": options.width, "height": options.height, "fx": K[0, 0], "fy": K[1, 1]}
+    camera |= {"cx": K[0, 2], "cy": K[1, 2], "fps": options.rate}
+    if world.camera_height_m is not None:
+        camera["camera_height_m"] = world.camera_height_m
+    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()] + ["model: pinhole"])
+    write_lines(root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)])
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:
@@ -19,11 +105,21 @@ def write_depth(path: Path, depth: Float32Array) -> None:
     _write_png(path, np.clip(np.rint(depth * 256.0), 0.0, 65535.0).astype(np.uint16))
 
 
-def write_calibration(path: Path, K: FloatArray, T_camera_lidar: FloatArray) -> None:
+def write_mesh(path: Path, vertices: Float32Array, triangles: NDArray[np.uint32]) -> None:
+    """Vertices ``(V, 3)`` and triangles ``(T, 3)`` as binary PLY."""
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, triangles
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    path.write_bytes("\n".join(header).encode() + vertices.astype("<f4").tobytes() + faces.tobytes())
+
+
+def write_calibration(path: Path, K: FloatArray, T_camera_lidar: FloatArray | None) -> None:
     """``calib.txt``: the one camera stands for all four."""
     projection = _row(np.column_stack([K, np.zeros(3)]))
     rows = [f"P{camera}: {projection}" for camera in range(4)]
-    write_lines(path, [*rows, f"Tr: {_row(T_camera_lidar[:3])}"])
+    write_lines(path, rows if T_camera_lidar is None else [*rows, f"Tr: {_row(T_camera_lidar[:3])}"])
 
 
 def write_poses(path: Path, T_world_camera: FloatArray) -> None:

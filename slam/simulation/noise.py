@@ -109,3 +109,8 @@ def band(x: Lengths, size: Lengths, low: Lengths | float, high: Lengths | float)
     """Fraction of each pixel covered by the one stripe [low, high]."""
     inverse = 1.0 / np.maximum(size, 1e-4)
     return np.asarray(np.clip((x - low) * inverse + 0.5, 0, 1) - np.clip((x - high) * inverse + 0.5, 0, 1))
+
+
+def mix(a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths) -> Float32Array:
+    """Blend colours ``(3, N)`` by a weight ``(N,)``."""
+    return np.asarray(a + fraction * (b - a), dtype=np.float32)

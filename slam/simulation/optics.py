@@ -19,6 +19,12 @@ def kitti_intrinsics(width: int, height: int) -> FloatArray:
     return np.array([[_KITTI_FOCAL_PX * sx, 0.0, cx], [0.0, _KITTI_FOCAL_PX * sy, cy], [0.0, 0.0, 1.0]])
 
 
+def square_intrinsics(width: int, height: int, fov_deg: float) -> FloatArray:
+    """Camera matrix ``(3, 3)`` of square pixels with a horizontal field of view, its centre in the middle."""
+    focal_px = 0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg))
+    return np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+
+
 @dataclass(frozen=True)
 class Mount:
     """A camera that differs from KITTI's.

@@ -40,7 +40,7 @@ def facing_normals(mesh: Mesh, triangle: NDArray[np.int64], rays: Float32Array) 
 
 
 def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px: float) -> Float32Array:
-    """Colour of each hit, ``(3, N)``.
+    """Colour of each hit in the open, ``(3, N)``.
 
     Args:
         mesh: what was hit.
@@ -49,6 +49,14 @@ def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px:
         weather: of the world.
         focal_px: focal length in pixels.
     """
+    rgb = unlit(mesh, hits, focal_px)
+    rgb *= light(weather, hits.normals, lit)
+    haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+    return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
+
+
+def unlit(mesh: Mesh, hits: Hits, focal_px: float) -> Float32Array:
+    """Colour of each hit under white light, ``(3, N)``; arguments as in `paint`."""
     tangents = np.take(mesh.tangents, hits.triangle, axis=1)
     u_size, v_size = footprint(hits.depth / np.float32(focal_px), hits.rays, hits.normals, tangents)
     corners = np.take(mesh.uv, hits.triangle, axis=2)  # (3, 2, N)
@@ -65,6 +73,4 @@ def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px:
         colours = np.take(mesh.colours, instance[part], axis=2)
         parameters = np.take(mesh.parameters, instance[part], axis=1)
         rgb[:, part] = shade(Material(kind), texels, colours, parameters)
-    rgb *= light(weather, hits.normals, lit)
-    haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
-    return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
+    return rgb

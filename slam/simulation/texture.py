@@ -5,8 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.simulation import interior
 from slam.simulation.geometry import Float32Array, Material
-from slam.simulation.noise import Lengths, Texels, band, cell_hash, fractal, stripes
+from slam.simulation.noise import Texels, band, cell_hash, fractal, mix, stripes
 
 Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
 
@@ -26,11 +27,6 @@ def shade(material: Material, texels: Texels, colours: Float32Array, parameters:
     return _SHADERS[material](texels, colours, parameters)
 
 
-def _mix(a: Lengths, b: Lengths, fraction: Lengths) -> Float32Array:
-    """Blend colours ``(3, N)`` by a weight ``(N,)``."""
-    return np.asarray(a + fraction * (b - a), dtype=np.float32)
-
-
 def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     rgb = _junction(texels, colours, parameters)
     half, dash, fraction = parameters[0, 0], parameters[1, 0], parameters[2, 0]
@@ -40,7 +36,7 @@ def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) ->
         paint += band(np.abs(texels.v), texels.v_size, half - 2.15, half - 2.03)
     painted = np.flatnonzero(paint > 0.01)
     wear = np.clip(0.78 + fractal(_take(texels, painted), (0.9, 0.2, 0.5), (0.3, 0.1, 0.3)), 0.15, 1.0)
-    rgb[:, painted] = _mix(rgb[:, painted], colours[1][:, painted], paint[painted] * wear)
+    rgb[:, painted] = mix(rgb[:, painted], colours[1][:, painted], paint[painted] * wear)
     return rgb
 
 
@@ -60,13 +56,13 @@ def _pavement(texels: Texels, colours: Float32Array, parameters: Float32Array) -
     near = np.clip(slab / np.maximum(texels.u_size, texels.v_size) / 2.0 - 0.5, 0.0, 1.0)
     tone = (cell_hash(texels.u / slab, texels.v / slab, 1) - 0.5) * near * 0.3
     grain = fractal(texels, (4.0, 4.0, 0.2), (1.0, 1.0, 0.16), (0.25, 0.25, 0.2), (0.08, 0.08, 0.12))
-    return _mix(colours[0] * (1.0 + grain + tone), 0.6 * colours[1], joints)
+    return mix(colours[0] * (1.0 + grain + tone), 0.6 * colours[1], joints)
 
 
 def _kerb(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     joints = stripes(texels.u, texels.u_size, 1.0, 0.03)
     grain = fractal(texels, (2.5, 2.5, 0.14), (0.5, 0.5, 0.16), (0.12, 0.12, 0.16))
-    return _mix(colours[0] * (1.0 + grain), 0.6 * colours[1], joints)
+    return mix(colours[0] * (1.0 + grain), 0.6 * colours[1], joints)
 
 
 def _mottled(*octaves: tuple[float, float, float]) -> Shader:
@@ -74,7 +70,7 @@ def _mottled(*octaves: tuple[float, float, float]) -> Shader:
 
     def shader(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
         fraction = np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2)
-        return _mix(colours[0], colours[1], fraction)
+        return mix(colours[0], colours[1], fraction)
 
     return shader
 
@@ -90,7 +86,7 @@ def _wall(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     tone = 0.3 * fade * (cell_hash(u / 0.44 + 0.5 * np.floor(v / row), v / row, 2) - 0.5)
     foot = 0.25 * band(v, texels.v_size, -1.0, 0.5) + 0.12 * np.clip(1.5 - v, 0.0, 1.0)
     rgb = colours[0] * (1.0 + grain + tone - foot - 0.22 * np.maximum(joints, brick))
-    rgb = _mix(rgb, 0.8 * colours[1], band(v, texels.v_size, height - 0.35, height - 0.05))
+    rgb = mix(rgb, 0.8 * colours[1], band(v, texels.v_size, height - 0.35, height - 0.05))
     glazed = np.flatnonzero((window > 0.0) & (v < height - 0.3))
     if len(glazed):
         chosen = colours[..., glazed], parameters[:, glazed]
@@ -125,10 +121,10 @@ def _windows(rgb: Float32Array, texels: Texels, colours: Float32Array, parameter
     glass = sheen * np.array([[0.75], [0.85], [0.95]], dtype=np.float32)
     leaf = (0.3 + 0.5 * tone) * colours[1]
     inside = np.where(door, leaf, glass)
-    inside = _mix(inside, 0.8 * colours[1], bars * (window > 1.0))
+    inside = mix(inside, 0.8 * colours[1], bars * (window > 1.0))
     visible = ~blind
-    rgb = _mix(rgb, colours[1], framed * visible)
-    return _mix(rgb, inside, pane * visible)
+    rgb = mix(rgb, colours[1], framed * visible)
+    return mix(rgb, inside, pane * visible)
 
 
 def _roof(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
@@ -148,28 +144,28 @@ def _sign(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     edge = np.where(kind == 0, np.hypot(x, y), np.maximum(np.abs(x), np.abs(y))) / half
     rim = np.clip((edge - 0.72) * half / size + 0.5, 0.0, 1.0)
     bar = band(y, texels.v_size, -0.14 * half, 0.16 * half) * band(np.abs(x), texels.u_size, -1.0, 0.5 * half)
-    plain = _mix(colours[1], colours[0], np.maximum(rim, bar))
-    inverse = _mix(colours[0], colours[1], np.maximum(rim, bar))
+    plain = mix(colours[1], colours[0], np.maximum(rim, bar))
+    inverse = mix(colours[0], colours[1], np.maximum(rim, bar))
     return np.asarray(np.where((kind == 2), inverse, plain))
 
 
 def _paint(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     seams = np.maximum(stripes(texels.u - 0.2, texels.u_size, 1.05, 0.05), band(texels.v, texels.v_size, -0.1, 0.1))
     light = 1.0 + 0.25 * np.clip(texels.v - 0.3, -0.4, 0.5) + fractal(texels, (1.3, 0.3, 0.16), (0.3, 0.2, 0.1))
-    return _mix(colours[0] * light, colours[1], 0.7 * seams)
+    return mix(colours[0] * light, colours[1], 0.7 * seams)
 
 
 def _glass(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     pillars = stripes(texels.u + 0.05, texels.u_size, 1.1, 0.14)
     sheen = np.clip(1.0 + 1.6 * fractal(texels, (0.8, 0.35, 1.0), (0.3, 0.2, 0.5)), 0.3, 4.0)
     rgb = colours[0] * sheen
-    return _mix(rgb, colours[1], np.maximum(pillars, band(texels.v, texels.v_size, -0.2, 0.05)))
+    return mix(rgb, colours[1], np.maximum(pillars, band(texels.v, texels.v_size, -0.2, 0.05)))
 
 
 def _tyre(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     radius = np.hypot(texels.u, texels.v)
     size = np.maximum(texels.u_size, texels.v_size)
-    return _mix(colours[0], colours[1], band(radius, size, -1.0, 0.19))
+    return mix(colours[0], colours[1], band(radius, size, -1.0, 0.19))
 
 
 def _fence(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
@@ -177,7 +173,7 @@ def _fence(texels: Texels, colours: Float32Array, parameters: Float32Array) -> F
     slats = stripes(texels.u, texels.u_size, gap, 0.35 * gap)
     rails = 1.0 - band(texels.v, texels.v_size, 0.78 * height, 0.88 * height)
     grain = fractal(texels, (1.7, 0.9, 0.25), (0.25, 0.8, 0.2))
-    return _mix(colours[0] * (1.0 + grain), colours[1], slats * rails)
+    return mix(colours[0] * (1.0 + grain), colours[1], slats * rails)
 
 
 def _take(texels: Texels, chosen: NDArray[np.int64]) -> Texels:
@@ -203,4 +199,5 @@ _SHADERS: dict[Material, Shader] = {
     Material.GLASS: _glass,
     Material.TYRE: _tyre,
     Material.FENCE: _fence,
+    **interior.SHADERS,
 }

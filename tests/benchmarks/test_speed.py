@@ -63,7 +63,8 @@ def test_box_mean_against_pooling(cpu_ms: Clock) -> None:
 
 
 def test_simulated_street(cpu_ms: Clock) -> None:
-    from slam.simulation.street import SimulatedStreet, SimulationOptions
+    from slam.simulation.options import SimulationOptions
+    from slam.simulation.street import SimulatedStreet
 
     street = SimulatedStreet(SimulationOptions(frames=250, seed=700))
     cost = cpu_ms(lambda: [street.render(k) for k in range(0, 250, 10)])[0] / 25

@@ -28,7 +28,8 @@ from slam.pipeline.estimate import Estimate
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
 
 FACTOR = 0.2  # unscaled lengths per metre
 NOISE = {"rotation_sigma": np.deg2rad(0.3), "translation_relative_sigma": 0.05, "depth_relative_sigma": 0.03}

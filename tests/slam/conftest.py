@@ -16,7 +16,9 @@ from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
-from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 MakeRun = Callable[..., RunFolder]
 

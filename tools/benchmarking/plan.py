@@ -159,7 +159,7 @@ def worlds(
     ``truth`` is what is written beside the images, ``size`` their width and height in place of the simulator's own.
     """
     from slam.simulation.hazards import Hazard
-    from slam.simulation.street import VERSION
+    from slam.simulation.options import VERSION
 
     every_hazard = ",".join(get_args(Hazard))
     flags, beside = [f"--{kind}" for kind in truth], "".join(f"-{kind}" for kind in truth)

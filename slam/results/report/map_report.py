@@ -35,7 +35,7 @@ _FILTERS = {
     "agreement": "the keyframe before does not agree (mapping.max_depth_difference)",
 }
 _TRUTHS = {
-    "exact surface": "the exact surface of the simulated street",
+    "exact surface": "the exact surface of the simulated world",
     "depth maps": "depth maps accumulated at true poses",
     "lidar": "LiDAR scans accumulated at true poses, moving objects among them",
 }

@@ -32,6 +32,7 @@ from slam.sequences.recording import (
     read_stamps,
     scans_in,
 )
+from slam.sequences.true_mesh import distance_to_mesh
 
 
 def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> RecordedSequence:
@@ -51,10 +52,11 @@ def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Re
     stamps = _stamps(folder / "times.txt", files)
     calibration = CalibrationFile(folder / ODOMETRY_CALIBRATION)
     T_camera_cam0 = calibration.T_camera_cam0(f"P{number}")
+    simulated = root.simulation_seed()
     camera: CameraFile | Intrinsics
     if asked is None:
         camera = Intrinsics.of(calibration.pinhole(f"P{number}", stored.width, stored.height))
-        height_m = height_beside(CAMERA_HEIGHT_M, root.base)
+        height_m = height_beside(CAMERA_HEIGHT_M if simulated is None else None, root.base)
     else:
         camera, height_m = explicit_camera(asked, stored), CAMERA_HEIGHT_M
     return RecordedSequence(
@@ -68,6 +70,7 @@ def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Re
         T_camera_lidar=_T_camera_lidar(calibration, T_camera_cam0),
         scans=scans_in(folder / "velodyne", files),
         depth_maps=depth_maps_in(folder / f"depth_{number}", files),
+        distance_to_surface=None if simulated is None else distance_to_mesh(root.base / "mesh.ply"),
     )
 
 

@@ -18,7 +18,9 @@ from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, split_recordings
 from erfsfm.training.run import train
-from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 SIZE = (64, 96)
 

@@ -20,7 +20,8 @@ from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 FRAMES = 9
 

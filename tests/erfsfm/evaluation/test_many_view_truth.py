@@ -7,7 +7,9 @@ from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.evaluation.many_view_truth import many_view_protocol
-from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 HEIGHT_M = 1.65
 EVERY = 6

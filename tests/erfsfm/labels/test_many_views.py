@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from erfsfm.labels.many_views import direction_of_travel, label, sky_mask
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)
 

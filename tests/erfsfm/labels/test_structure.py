@@ -9,7 +9,8 @@ from erfsfm.labels.road import on_road, road_plane, under_road
 from erfsfm.labels.structure import StructureCache, TeacherStructure, measure_structure
 from erfsfm.labels.two_view import two_view
 from erfsfm.mvs.flow import rays
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 
 @pytest.fixture(scope="module")

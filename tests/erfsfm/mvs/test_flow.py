@@ -5,7 +5,8 @@ import pytest
 
 from erfsfm.mvs.flow import combine, guided_flow, measure, rays, triangulate
 from erfsfm.mvs.projection import Projection
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ import pytest
 from slam.frames import Frame, Image
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 QUALITIES = range(60, 90, 3)
 

@@ -9,7 +9,8 @@ from erfsfm.common.readers.scan import read_velodyne
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.sequences.catalogue import open_sequence
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 FRAMES = 15
 

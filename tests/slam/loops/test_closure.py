@@ -19,7 +19,7 @@ from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import SimulationOptions
 
 SIZE = (312, 96)
 FACTOR = 0.2

@@ -31,7 +31,7 @@ from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.growing import GrowingSequence
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import SimulationOptions
 
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 HEIGHT_M = 1.5

@@ -17,7 +17,7 @@ from slam.mapping.fusion import Fusion
 from slam.pipeline.batch import SlamPipeline
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import SimulationOptions
 
 FRAMES = 60
 # calls over frames: a step measured by geometry, whose tracks all pass the first search at best

@@ -21,7 +21,9 @@ from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import DRIVE, KEYFRAMES
 from slam.sequences.catalogue import open_sequence
-from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 SAME = (
     *(f"trajectory_{name}.tum.txt" for name in ("network", "odometry", "optimised")),

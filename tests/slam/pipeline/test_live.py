@@ -24,7 +24,7 @@ from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import SlamError
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import SimulationOptions
 
 FACTOR = 0.2
 FRAMES = 250

@@ -30,7 +30,7 @@ from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.timing import Stopwatch
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import SimulationOptions
 
 FRAMES = 60
 BAD = range(25, 35)

@@ -20,7 +20,8 @@ from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.recording import RecordedSequence
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
 
 OPTIONS = SimulationOptions("straight", frames=24, seed=702, width=312, height=96)
 

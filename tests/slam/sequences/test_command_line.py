@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from slam.commands.cli import main
-from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 Call = Callable[..., tuple[int, str]]
 SETTINGS = ["--set", "mapping.enabled=false", "--set", "output.report=false"]

@@ -3,7 +3,7 @@ import pytest
 
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import SimulationOptions
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,9 @@ import yaml
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
-from slam.simulation.street import SimulatedStreet, SimulationOptions, parse_options, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions, parse_options
+from slam.simulation.street import SimulatedStreet
 
 SMALL = {"width": 208, "height": 64}
 

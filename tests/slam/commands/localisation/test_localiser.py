@@ -27,7 +27,7 @@ from slam.results.metrics import ScaleMetrics
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import PLACES
 from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.street import SimulationOptions
+from slam.simulation.options import SimulationOptions
 
 CONFIG = LoopsConfig()
 UNIT = 0.5  # lengths of the map per metre

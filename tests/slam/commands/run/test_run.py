@@ -23,7 +23,8 @@ from slam.pipeline.batch import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.storage.record import Missing
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 CheckRun = Callable[[Path], dict[str, Any]]
 CopyRoot = Callable[[], Path]

@@ -22,7 +22,9 @@ from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
 from slam.runtime.run_files import KEYFRAMES, PLACES
 from slam.sequences.catalogue import open_sequence
-from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 CheckRun = Callable[[Path], dict[str, Any]]
 PLAIN = ["output.report=false", "mapping.enabled=false"]

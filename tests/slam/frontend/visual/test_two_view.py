@@ -16,7 +16,8 @@ from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, TwoViewEstimator
 from slam.geometry import se3
-from slam.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 CONFIG = VisualOdometryConfig()
 FOCAL_PX = 240.0

@@ -1,0 +1,186 @@
+"""A furnished house as a world: several rooms, a corridor and a hall, and a camera that is carried through them."""
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry import se3
+from slam.runtime.errors import SequenceError
+from slam.simulation.floor import Floor
+from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, Soup
+from slam.simulation.hazards import SHUTTER
+from slam.simulation.house import House, draw_house
+from slam.simulation.interior import GLOWING
+from slam.simulation.interiors import Interior, furnish
+from slam.simulation.lighting import illuminate
+from slam.simulation.motion import Carried, carry
+from slam.simulation.moving import Moving
+from slam.simulation.objects import person
+from slam.simulation.optics import square_intrinsics
+from slam.simulation.options import SimulationOptions
+from slam.simulation.painter import Hits, unlit
+from slam.simulation.surface import Surface, place_rays
+from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
+
+STILL_S = 3.0
+READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
+_USUAL_FOV_DEG, _VARIED_FOV_DEG = 65.0, (55.0, 100.0)
+_PEOPLE, _AHEAD_S, _NEAREST_M = 6, 3.5, 0.7  # the first of them walks ahead of the camera
+_GREY = 0.4  # brightness that exposure aims at
+_LONGEST_S, _METER_S, _METERED = 0.02, 0.1, 12  # exposure in the light; the meter's period, and how often it is read
+
+
+class SimulatedRooms(SimulatedWorld):
+    """A house and a walk through it; the attributes are those of `SimulatedWorld`."""
+
+    def __init__(self, options: SimulationOptions) -> None:
+        """Plan the house and the walk.
+
+        Raises:
+            SequenceError: if there are too few frames.
+        """
+        if options.frames < 2:
+            raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
+        house, self._interior = _furnished_house(options.seed)
+        self._lights = self._interior.lights.copy()
+        if "exposure" in options.hazards:  # some rooms are dim
+            strength = np.exp(np.random.default_rng([options.seed, 54]).uniform(-1.5, 0.5, len(house.rooms)))
+            for room, factor in zip(house.rooms, strength):
+                self._lights[room.contains(self._lights[:, :2]), 3] *= factor
+        floor = Floor(house, self._interior.obstacles, options.seed)
+        seconds = options.frames / options.rate + _AHEAD_S + 1.0
+        motions = _PEOPLE if "people" in options.hazards else 1
+        self._carried = carry(floor, options.motion or "walk", seconds, options.rate, options.seed)
+        self._walks = [carry(floor, "walk", seconds, options.rate, options.seed + 1000 * k) for k in range(1, motions)]
+        self._people = _people(options.seed) if "people" in options.hazards else None
+        fov = _USUAL_FOV_DEG
+        if options.varied:
+            fov = float(np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG))))
+        T_scene_camera = self._carried.poses(self._moments(np.arange(options.frames) / options.rate, options))
+        super().__init__(options, square_intrinsics(options.width, options.height, fov), T_scene_camera)
+
+    def _build(self) -> Mesh:
+        return self._interior.mesh
+
+    @functools.cached_property
+    def _irradiance(self) -> Float32Array:
+        return illuminate(self._still, self._lights)
+
+    def _moments(self, seconds: FloatArray, options: SimulationOptions) -> FloatArray:
+        """Where in the motion the camera is at times ``(N,)``: it is put down in the middle, if wanted."""
+        if "stop" not in options.hazards:
+            return seconds
+        middle = 0.5 * max(options.frames / options.rate - STILL_S, 0.0)
+        return seconds - np.clip(seconds - middle, 0.0, STILL_S)
+
+    def _exposures(self, index: int) -> FloatArray:
+        options = self.options
+        offsets = np.zeros((1, 1))
+        if "blur" in options.hazards:
+            turned = np.diff(self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2], axis=0)
+            open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, 2.0 * SHUTTER * 0.9 / options.rate)
+            blurred_px = np.linalg.norm(turned, axis=1).max() * open_s * options.rate * self.K[0, 0]
+            samples = int(np.clip(blurred_px / 4.0, 3, 12))
+            offsets = offsets + open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
+        if "rolling-shutter" in options.hazards:
+            rows = (np.arange(options.height) + 0.5) / options.height - 0.5
+            offsets = offsets + min(READOUT_S, 0.9 / options.rate) * rows
+        moments = self._moments(index / options.rate + offsets.ravel(), options)
+        poses = self._carried.poses(np.maximum(moments, 0.0)).reshape(*offsets.shape, 4, 4)
+        return poses[:, 0] if offsets.shape[1] == 1 else poses
+
+    def _moving(self, index: int) -> Mesh | None:
+        if self._people is None:
+            return None
+        now = index / self.options.rate
+        T_scene_people = [_standing(self._carried, now + _AHEAD_S), *(_standing(walk, now) for walk in self._walks)]
+        camera = self._T_scene_camera[index, :2, 3]
+        far = [np.linalg.norm(T[:2, 3] - camera) > _NEAREST_M for T in T_scene_people]
+        return self._people.placed({number: T for number, T in enumerate(T_scene_people) if far[number]})
+
+    def _background(self, directions: Float32Array) -> Float32Array:
+        return np.zeros_like(directions)
+
+    def _shade(
+        self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
+    ) -> Float32Array:
+        rgb = unlit(surfaces[number].mesh, hits, float(self.K[0, 0]))
+        if number > 0:  # people are as bright as what is below them
+            down = rays.copy()
+            down[:, :3] += rays[:, 3:] * hits.depth[:, None]
+            down[:, 3:] = (0.0, 0.0, -1.0)
+            hits_below = self._still.cast(down)
+            below = np.minimum(hits_below["primitive_ids"].astype(np.int64), self._irradiance.shape[1] - 1)
+            return np.asarray(rgb * self._irradiance[:, below].mean(axis=0) * (0.85 + 0.15 * hits.normals[2]))
+        return np.asarray(rgb * self._light(hits.triangle, hits.barycentric))
+
+    def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
+        """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""
+        corners = np.take(self._irradiance, triangle, axis=1)
+        light = corners[0] + barycentric[0] * (corners[1] - corners[0]) + barycentric[1] * (corners[2] - corners[0])
+        glow = _GLOW[np.take(self._still.mesh.material, triangle)]
+        return np.asarray(np.where(glow > 0.0, glow, light))
+
+    def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
+        """Gain, lens blur, noise, and quantisation to 8 bits."""
+        gain = self._gain(index)
+        rgb = through_lens(rgb * np.float32(gain))
+        if "exposure" in self.options.hazards:
+            rng = np.random.default_rng([self.options.seed, 56, index])
+            rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(0.008 * np.sqrt(gain))
+        return in_bytes(rgb)
+
+    def _gain(self, index: int) -> float:
+        """Of the sensor: the world's own, or one that follows the light of the last second."""
+        if "exposure" not in self.options.hazards:
+            return self._usual_gain
+        last = int(index / self.options.rate / _METER_S)
+        read = np.array([self._brightness(max(last - k, 0)) for k in range(_METERED)])
+        return float(_GREY / max((read * np.exp(-_METER_S * np.arange(_METERED) / 0.35)).sum() / _METER_WEIGHT, 0.06))
+
+    @functools.cached_property
+    def _usual_gain(self) -> float:
+        last = int(len(self) / self.options.rate / _METER_S)
+        read = [self._brightness(int(tick)) for tick in np.linspace(0, last, _METERED)]
+        return float(_GREY / np.median(read))
+
+    @functools.lru_cache(maxsize=256)  # noqa: B019 - a reading is small, and a world is kept for long
+    def _brightness(self, tick: int) -> float:
+        """Mean of a coarse image without textures, as the camera's meter sees it."""
+        moment = self._moments(np.array([tick * _METER_S]), self.options)
+        few = self._rays[:: max(len(self._rays) // 400, 1)]
+        answer = self._still.cast(place_rays(self._carried.poses(moment)[0], few))
+        met = np.isfinite(answer["t_hit"])
+        triangle = answer["primitive_ids"][met].astype(np.int64)
+        light = self._light(triangle, answer["primitive_uvs"][met].T)
+        colours = self._still.mesh.colours[0].mean(axis=0)
+        return float(np.minimum(light * colours[self._still.mesh.instance[triangle]], 1.5).mean())
+
+
+_GLOW = np.array([GLOWING.get(material, 0.0) for material in Material], dtype=np.float32)
+_METER_WEIGHT = float(np.exp(-_METER_S * np.arange(_METERED) / 0.35).sum())
+
+
+@functools.lru_cache(maxsize=4)
+def _furnished_house(seed: int) -> tuple[House, Interior]:
+    """A house, which several motions and hazards share."""
+    house = draw_house(seed)
+    return house, furnish(house, seed)
+
+
+def _people(seed: int) -> Moving:
+    """People around their own origins, who look along x."""
+    rng = np.random.default_rng([seed, 57])
+    soup, firsts = Soup(rng), []
+    for _ in range(_PEOPLE):
+        firsts.append(soup.instances)
+        person(soup, rng, 0.0, 0.0)
+    return Moving(soup, firsts)
+
+
+def _standing(walk: Carried, seconds: float) -> FloatArray:
+    """``T_scene_person`` of whoever walks so, upright on the floor."""
+    x, y, _, yaw, _, _ = walk.at(np.array([seconds]))[:, 0]
+    c, s = np.cos(yaw), np.sin(yaw)
+    return se3.make(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, -0.1]))

@@ -1,0 +1,178 @@
+"""A simulated world: surfaces that rays meet, a camera that moves among them, and the truth about both."""
+
+import functools
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry import se3
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.simulation.optics import pixel_rays
+from slam.simulation.options import SimulationOptions
+from slam.simulation.painter import Hits, facing_normals
+from slam.simulation.surface import Surface, distances, place_rays
+
+FARTHEST_M = 200.0  # surfaces beyond are treated as sky
+
+
+@dataclass(frozen=True)
+class SimulatedFrame:
+    """One frame with its truth.
+
+    Attributes:
+        index: number of the frame.
+        stamp: seconds.
+        image: ``(H, W, 3)`` uint8 RGB.
+        depth: z-depth in metres, 0 where nothing was hit, ``(H, W)`` float32.
+        T_world_camera: pose in the frame of the first camera, ``(4, 4)``.
+    """
+
+    index: int
+    stamp: float
+    image: NDArray[np.uint8]
+    depth: Float32Array
+    T_world_camera: FloatArray
+
+
+class SimulatedWorld(ABC):
+    """A world and a way through it; frames are rendered on demand. The scene is x east, y north, z up, metres.
+
+    Attributes:
+        options: what is simulated.
+        K: camera matrix, ``(3, 3)``.
+        T_world_camera: every pose in the frame of the first camera, ``(N, 4, 4)``.
+        camera_height_m: of the camera above the road; None where there is no road.
+        T_camera_lidar: ``(4, 4)``; None without a LiDAR.
+    """
+
+    camera_height_m: float | None = None
+    T_camera_lidar: FloatArray | None = None
+
+    def __init__(self, options: SimulationOptions, K: FloatArray, T_scene_camera: FloatArray) -> None:
+        """A world seen through a camera from poses ``(N, 4, 4)``."""
+        self.options, self.K = options, K
+        self._T_scene_camera = T_scene_camera
+        self.T_world_camera: FloatArray = se3.invert(T_scene_camera[0]) @ T_scene_camera
+        self.T_world_camera[0] = np.eye(4)
+        self._rays = pixel_rays(K, options.width, options.height)
+        self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)  # ray length per depth
+
+    @abstractmethod
+    def _build(self) -> Mesh:
+        """Every surface that stands still."""
+
+    @abstractmethod
+    def _moving(self, index: int) -> Mesh | None:
+        """What moves, as it is at a frame; None where nothing does."""
+
+    @abstractmethod
+    def _background(self, directions: Float32Array) -> Float32Array:
+        """Colour along unit directions that meet nothing, ``(3, N)`` both."""
+
+    @abstractmethod
+    def _shade(
+        self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
+    ) -> Float32Array:
+        """Colour ``(3, N)`` of hits on one of the surfaces by rays ``(N, 6)`` through pixels ``(N,)``."""
+
+    @abstractmethod
+    def _exposures(self, index: int) -> FloatArray:
+        """Poses from which the image is taken, which is their mean: ``(S, 4, 4)``, or ``(S, H, 4, 4)``, one a row."""
+
+    @abstractmethod
+    def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
+        """The image of light ``(H, W, 3)`` that fell on the sensor."""
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self.options.frames
+
+    def render(self, index: int) -> SimulatedFrame:
+        """Image and depth of one frame; the same index gives the same bytes."""
+        self._require(index)
+        surfaces, poses = self._surfaces(index), self._exposures(index)
+        views = (self._view(surfaces, T_scene_camera) for T_scene_camera in poses)
+        if len(poses) == 1 and np.array_equal(poses[0], self._T_scene_camera[index]):
+            rgb, depth = next(views)
+        else:
+            rgb, depth = np.mean([view[0] for view in views], axis=0), self.depth(index)
+        stamp = index / self.options.rate
+        return SimulatedFrame(index, stamp, self._develop(rgb, index), depth, self.T_world_camera[index].copy())
+
+    def depth(self, index: int) -> Float32Array:
+        """The z-depth ``(H, W)`` of `render`, without the image."""
+        self._require(index)
+        rays = place_rays(self._T_scene_camera[index], self._rays)
+        depth: Float32Array = np.min([surface.cast(rays)["t_hit"] for surface in self._surfaces(index)], axis=0)
+        depth[depth >= FARTHEST_M] = 0.0
+        return depth.reshape(self.options.height, self.options.width)
+
+    def distance_to_surface(self, points_world: NDArray[np.floating[Any]]) -> FloatArray:
+        """Distance in metres from points ``(M, 3)`` to the nearest static surface, ``(M,)``."""
+        points = se3.apply(self._T_scene_camera[0], np.asarray(points_world, dtype=np.float64))
+        return distances(self._still.scene, points)
+
+    def mesh_world(self) -> tuple[Float32Array, NDArray[np.uint32]]:
+        """Vertices ``(V, 3)`` in the frame of the first camera and triangles ``(T, 3)`` of what stands still."""
+        mesh = self._still.mesh
+        vertices = se3.apply(se3.invert(self._T_scene_camera[0]), mesh.vertices.astype(np.float64))
+        return vertices.astype(np.float32), mesh.triangles
+
+    def scan(self, index: int) -> Float32Array:
+        """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
+        raise NotImplementedError(f"frame {index}: this world has no LiDAR")
+
+    @functools.cached_property
+    def _still(self) -> Surface:
+        return Surface.of(self._build())
+
+    def _surfaces(self, index: int) -> list[Surface]:
+        """The surfaces at a frame: what stands still, and what moves."""
+        moving = self._moving(index)
+        return [self._still] if moving is None else [self._still, Surface.of(moving)]
+
+    def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or from one of each row."""
+        rays = place_rays(T_scene_camera, self._rays)  # z = 1, so that t is z-depth
+        unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
+        answers = [surface.cast(rays) for surface in surfaces]
+        depths = np.stack([answer["t_hit"] for answer in answers])
+        nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
+        depth[depth >= FARTHEST_M] = 0.0
+        rgb = np.empty((len(rays), 3), dtype=np.float32)
+        unseen = np.flatnonzero(depth == 0.0)
+        rgb[unseen] = self._background(unit[:, unseen]).T
+        for number, (surface, answer) in enumerate(zip(surfaces, answers)):
+            seen = np.flatnonzero((nearest == number) & (depth > 0.0))
+            triangle = answer["primitive_ids"][seen].astype(np.int64)
+            order = np.argsort(np.take(surface.mesh.material, triangle), kind="stable")
+            seen, triangle = seen[order], triangle[order]
+            hits = Hits(
+                triangle=triangle,
+                barycentric=np.take(answer["primitive_uvs"], seen, axis=0).T,
+                rays=np.take(unit, seen, axis=1),
+                normals=facing_normals(surface.mesh, triangle, np.take(unit, seen, axis=1)),
+                depth=depth[seen],
+                distance=depth[seen] * self._stretch[seen],
+            )
+            rgb[seen] = self._shade(surfaces, number, hits, np.take(rays, seen, axis=0), seen).T
+        shape = self.options.height, self.options.width
+        return rgb.reshape(*shape, 3), depth.reshape(shape)
+
+    def _require(self, index: int) -> None:
+        if not 0 <= index < len(self):
+            raise IndexError(f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}")
+
+
+def through_lens(rgb: Float32Array) -> Float32Array:
+    """An image as blurred as a lens blurs it."""
+    return np.asarray(cv2.GaussianBlur(rgb, (3, 3), 0.55))
+
+
+def in_bytes(rgb: Float32Array) -> NDArray[np.uint8]:
+    """An image about [0, 1] in 8 bits."""
+    return np.asarray(np.clip(rgb * np.float32(255.0) + np.float32(0.5), 0.0, 255.0)).astype(np.uint8)

@@ -1,0 +1,152 @@
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from slam.geometry import se3
+from slam.results.map_error import DepthTruth, find_truth
+from slam.runtime.errors import SequenceError
+from slam.sequences.catalogue import open_sequence
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.motion import FASTEST_TURN_DEG, Motion
+from slam.simulation.options import SimulationOptions, parse_options
+from slam.simulation.rooms import SimulatedRooms
+
+SMALL = {"width": 96, "height": 72}
+
+
+def rooms(frames: int = 60, seed: int = 1, **options: object) -> SimulatedRooms:
+    return SimulatedRooms(SimulationOptions("rooms", frames, seed, **(SMALL | options)))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def walk() -> SimulatedRooms:
+    return rooms()
+
+
+def turns_deg(world: SimulatedRooms) -> np.ndarray:
+    T_before_after = se3.invert(world.T_world_camera[:-1]) @ world.T_world_camera[1:]
+    return np.rad2deg(se3.rotation_angle(T_before_after[:, :3, :3]))
+
+
+def test_depth_at_true_poses_explains_the_next_depth(walk: SimulatedRooms) -> None:
+    for k in (5, 30):
+        a, b = walk.render(k), walk.render(k + 1)
+        v, u = np.mgrid[0:72, 0:96].reshape(2, -1)
+        points = np.linalg.inv(walk.K) @ np.stack([u, v, np.ones_like(u)]) * a.depth.ravel()
+        moved = se3.apply(se3.invert(b.T_world_camera) @ a.T_world_camera, points.T)
+        at = walk.K @ moved.T
+        at = at[:2] / at[2]
+        inside = ((at > 0) & (at < [[95], [71]])).all(axis=0) & (moved[:, 2] > 0.1)
+        seen = map_coordinates(b.depth, at[::-1, inside], order=1)
+        assert inside.mean() > 0.3
+        assert np.median(np.abs(seen / moved[inside, 2] - 1.0)) < 0.005
+
+
+def test_depth_is_the_distance_to_the_surface_and_closes_the_room(walk: SimulatedRooms) -> None:
+    frame = walk.render(7)
+    assert (frame.depth > 0).all() and frame.depth.max() < 50.0
+    v, u = np.mgrid[0:72:5, 0:96:5].reshape(2, -1)
+    points = (np.linalg.inv(walk.K) @ np.stack([u, v, np.ones_like(u)])).T * frame.depth[v, u][:, None]
+    assert np.quantile(walk.distance_to_surface(se3.apply(frame.T_world_camera, points)), 0.99) < 1e-3
+    assert np.array_equal(walk.depth(7), frame.depth)
+
+
+@pytest.mark.parametrize("motion", get_args(Motion))
+def test_camera_keeps_clear_of_walls_and_furniture_and_turns_no_faster_than_asked(motion: Motion) -> None:
+    world = rooms(600, 2, motion=motion, rate=5.0)
+    step = np.linalg.norm(np.diff(world.T_world_camera[:, :3, 3], axis=0), axis=1)
+    assert world.distance_to_surface(world.T_world_camera[:, :3, 3])[::3].min() >= 0.3
+    assert step.sum() > 20.0 and step.max() < 0.4
+    assert turns_deg(world).max() < 1.5 * FASTEST_TURN_DEG
+    assert se3.is_se3(world.T_world_camera, 1e-9) and np.array_equal(world.T_world_camera[0], np.eye(4))
+
+
+def test_a_higher_rate_takes_more_images_of_slower_turns() -> None:
+    assert turns_deg(rooms(240, 2, motion="phone", rate=60.0)).max() < 5.0 < turns_deg(rooms(240, 2, rate=5.0)).max()
+
+
+def test_same_options_give_the_same_bytes_and_other_seeds_another_house(walk: SimulatedRooms) -> None:
+    again, other = rooms(), rooms(seed=4)
+    assert np.array_equal(again.T_world_camera, walk.T_world_camera)
+    assert np.array_equal(again.render(9).image, walk.render(9).image)
+    assert np.abs(other.render(9).image.astype(float) - walk.render(9).image).mean() > 10
+
+
+@pytest.mark.parametrize("hazard", ["people", "exposure", "blur", "rolling-shutter"])
+def test_hazards_change_images_but_not_poses(walk: SimulatedRooms, hazard: str) -> None:
+    world = rooms(hazards=(hazard,))
+    changed = [np.abs(world.render(k).image.astype(float) - walk.render(k).image).mean() for k in (5, 20, 40, 55)]
+    assert max(changed) > 0.5
+    assert np.array_equal(world.T_world_camera, walk.T_world_camera)
+    if hazard != "people":
+        assert np.array_equal(world.depth(20), walk.depth(20))
+
+
+def test_people_have_depth() -> None:
+    empty, peopled = rooms(300, 2), rooms(300, 2, hazards=("people",))
+    nearer = [
+        ((peopled.depth(k) < empty.depth(k) - 0.05).mean(), (peopled.depth(k) > empty.depth(k)).any())
+        for k in range(0, 300, 12)
+    ]
+    assert max(share for share, _ in nearer) > 0.01 and not any(farther for _, farther in nearer)
+
+
+def test_exposure_follows_the_light() -> None:
+    world = rooms(300, 4, hazards=("exposure",))
+    brightness = [world.render(k).image.mean() for k in range(0, 300, 30)]
+    assert np.median(brightness) == pytest.approx(0.4 * 255, rel=0.4)
+    assert np.ptp([world._gain(k) for k in range(0, 300, 30)]) > 0.1
+
+
+def test_a_camera_that_is_put_down_lies_still_for_three_seconds() -> None:
+    world = rooms(100, 1, hazards=("stop",))
+    assert (turns_deg(world) == 0.0).sum() == pytest.approx(30, abs=2)
+
+
+def test_a_varied_house_has_another_lens(walk: SimulatedRooms) -> None:
+    assert walk.K[0, 0] == walk.K[1, 1] == pytest.approx(48 / np.tan(np.deg2rad(32.5)))
+    assert len({rooms(seed=seed, varied=True).K[0, 0] for seed in (1, 2, 4)}) == 3
+
+
+def test_a_root_on_disk_has_the_exact_surface(walk: SimulatedRooms, tmp_path: Path) -> None:
+    short, root = rooms(4, rate=30.0), tmp_path / "world"
+    write_kitti_root(short, root, depth=True, mesh=True)
+    sequence = open_sequence(root)
+    assert sequence.stamps == pytest.approx(np.arange(4) / 30.0) and sequence.camera_height_m is None
+    truth, embedded = find_truth(sequence), find_truth(SimulatedSequence(short.options))
+    points = np.random.default_rng(0).uniform(-2.0, 2.0, (50, 3))
+    for found in (truth, embedded):
+        assert isinstance(found, DepthTruth) and found.name == "exact surface" and found.distance is not None
+        assert found.distance(points) == pytest.approx(short.distance_to_surface(points), abs=1e-4)
+    assert len(truth.view(2).points) == len(embedded.view(2).points) > 1000  # type: ignore[union-attr]
+    (root / "mesh.ply").unlink()
+    found = find_truth(open_sequence(root))
+    assert isinstance(found, DepthTruth) and found.name == "depth maps"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"hazards": "rain"}, "hazards of rooms are people, exposure, blur, rolling-shutter, stop; got 'rain'"),
+        ({"route": "loop", "hazards": "people"}, "hazards of a street are moving-cars"),
+        ({"route": "loop", "motion": "walk"}, "motion and rate are of rooms"),
+        ({"route": "loop", "rate": 30.0}, "motion and rate are of rooms"),
+        ({"motion": "swim"}, "motion must be one of walk, look, phone, drone, robot; got 'swim'"),
+        ({"rate": 4.0}, "rate must be 5 to 60 frames a second; got 4"),
+        ({"frames": 1}, "at least 2 frames"),
+    ],
+)
+def test_invalid_options_are_refused(change: dict[str, object], says: str) -> None:
+    options = {"route": "rooms", "frames": 300, "seed": 0, "width": 96, "height": 72, "hazards": ""} | change
+    with pytest.raises(SequenceError, match=says):
+        SimulatedRooms(parse_options(**options))  # type: ignore[arg-type]
+
+
+def test_scans_are_refused_before_anything_is_written(walk: SimulatedRooms, tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="no LiDAR is carried through rooms"):
+        write_kitti_root(walk, tmp_path / "world", lidar=True)
+    assert list(tmp_path.iterdir()) == []

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
-from threading import RLock
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
+from typing import Any, Self
 
 import numpy as np
 
@@ -37,28 +33,10 @@ from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH
 from slam.runtime.storage.files import write_atomically
+from slam.runtime.threads import Turns, in_turn
 from slam.runtime.timing import Stopwatch
 from slam.sequences.growing import GrowingSequence
 from slam.sequences.recording import POSSIBLE_PERIODS_S
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def _in_turn(method: Callable[Concatenate[Slam, P], R]) -> Callable[Concatenate[Slam, P], R]:
-    """A method that threads call one after the other."""
-
-    @wraps(method)
-    def locked(self: Slam, *args: P.args, **kwargs: P.kwargs) -> R:
-        if os.getpid() != self._process:
-            raise SlamError(
-                "this session is of the process that made it, whose threads a forked one has not: make Slam there, or "
-                "start processes with multiprocessing.get_context('spawn')"
-            )
-        with self._lock:
-            return method(self, *args, **kwargs)
-
-    return cast("Callable[Concatenate[Slam, P], R]", locked)
 
 
 class Slam:
@@ -98,7 +76,7 @@ class Slam:
         Raises:
             SlamError: a scale mode that needs more than images, an impossible camera, or a number out of its range.
         """
-        self._lock, self._process = RLock(), os.getpid()
+        self._turns = Turns("Slam")
         _check(intrinsics, camera_height_m, config)
         config = config or SlamConfig()
         if update_frames < 1 or sweep_frames < 0 or not 0 <= seed < 2**31:
@@ -168,7 +146,7 @@ class Slam:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @_in_turn
+    @in_turn
     def close(self) -> None:
         """Finish every frame so far and end the threads; results stay available."""
         self._is_closed = True
@@ -177,7 +155,7 @@ class Slam:
         finally:
             self._observer.close()
 
-    @_in_turn
+    @in_turn
     def add_frame(self, image: Image, stamp: float) -> LivePose:
         """Process the next frame; the newest one that is finished, which may be the one before, is returned.
 
@@ -215,7 +193,7 @@ class Slam:
             self.close_loops()
         return self._newest
 
-    @_in_turn
+    @in_turn
     def save(self, path: str | Path) -> None:
         """Write all measurements to a file for `resume`; more frames may follow.
 
@@ -225,7 +203,7 @@ class Slam:
         checkpoint = SessionCheckpoint.of(self._sequence, self._observer.state(), self._weights_sha256)
         write_atomically(Path(path), checkpoint.write)
 
-    @_in_turn
+    @in_turn
     def resume(self, path: str | Path) -> None:
         """Continue after the last frame of a file by `save`, with the whole drive solved.
 
@@ -247,7 +225,7 @@ class Slam:
         self._sequence.stamps = checkpoint.stamps
         self.close_loops()
 
-    @_in_turn
+    @in_turn
     def trajectory(self) -> Trajectory:
         """All frames so far, lengths in `unit_name`; before the first snippet the camera is assumed to stay in place.
 
@@ -260,7 +238,7 @@ class Slam:
         self._poses.add(self._observer)
         return Trajectory(self._sequence.stamps.copy(), self._poses.T_world_camera)
 
-    @_in_turn
+    @in_turn
     def close_loops(self) -> LoopClosures:
         """Solve the whole drive so far with its loops, as ``run`` does; later frames go on from its poses.
 
@@ -276,7 +254,7 @@ class Slam:
         self._estimate = estimate
         return estimate.loops
 
-    @_in_turn
+    @in_turn
     def keyframes(self) -> Trajectory:
         """The frames whose corners `points` gives; the whole drive so far is solved first, as by `close_loops`.
 
@@ -286,7 +264,7 @@ class Slam:
         estimate = self._solved()
         return estimate.optimised.select(np.array([view.index for view in estimate.views], dtype=np.intp))
 
-    @_in_turn
+    @in_turn
     def points(self) -> FloatArray:
         """Points ``(M, 3)`` of the corners of `keyframes` in the world, in `unit_name`; raises as `keyframes`.
 
@@ -304,12 +282,12 @@ class Slam:
         known: FloatArray = points[np.isfinite(points).all(axis=1)]
         return known
 
-    @_in_turn
+    @in_turn
     def marginals(self, frame: int) -> FloatArray:
         """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`."""
         return self._solved().graph.marginal(frame)
 
-    @_in_turn
+    @in_turn
     def surface(self) -> Any:
         """The map of the drive so far as an Open3D ``TriangleMesh``, y down; raises as `keyframes`.
 

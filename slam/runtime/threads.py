@@ -1,14 +1,20 @@
-"""Work in other threads: reading ahead, and items side by side."""
+"""Work in other threads: reading ahead, items side by side, and calls in turn."""
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from functools import wraps
+from threading import RLock
+from typing import Concatenate, ParamSpec, Protocol, TypeVar, cast
+
+from slam.runtime.errors import SlamError
 
 S = TypeVar("S")
 T = TypeVar("T")
+P = ParamSpec("P")
 
 _CORES = 2
 
@@ -32,3 +38,38 @@ def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
     """The result of ``do`` for each item, in order; the calls must be independent."""
     with ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="side") as side:
         return list(side.map(do, items))
+
+
+class Turns:
+    """The lock of an object whose threads a forked process has not."""
+
+    def __init__(self, name: str) -> None:
+        """Of an object of the class ``name``, in this process."""
+        self.lock, self._process, self._name = RLock(), os.getpid(), name
+
+    def require_own_process(self) -> None:
+        """Raise in a forked process, where a call would wait for ever."""
+        if os.getpid() != self._process:
+            raise SlamError(
+                "this session is of the process that made it, whose threads a forked one has not: make "
+                f"{self._name} there, or start processes with multiprocessing.get_context('spawn')"
+            )
+
+
+class _HasTurns(Protocol):
+    _turns: Turns
+
+
+Owner = TypeVar("Owner", bound=_HasTurns)
+
+
+def in_turn(method: Callable[Concatenate[Owner, P], T]) -> Callable[Concatenate[Owner, P], T]:
+    """A method that threads call one after the other."""
+
+    @wraps(method)
+    def locked(self: Owner, *args: P.args, **kwargs: P.kwargs) -> T:
+        self._turns.require_own_process()
+        with self._turns.lock:
+            return method(self, *args, **kwargs)
+
+    return cast("Callable[Concatenate[Owner, P], T]", locked)

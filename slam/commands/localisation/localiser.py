@@ -141,7 +141,7 @@ class Localiser:
     def locate(self, name: str, image: Image) -> Localisation:
         """Localise an image ``(H, W, 3)`` uint8 RGB: at the similar place with most inliers, then in the map around it.
 
-        Triangulated points are tried first, then those of learned depth as well.
+        Points of learned depth are used beside triangulated ones where both agree, else only if these are too few.
 
         Raises:
             SequenceError: the image has another shape than its camera.
@@ -150,9 +150,10 @@ class Localiser:
         rows = self._index.nearest(view, _PLACES_TRIED)
         if not rows:
             return Localisation(name, reason="no place of the map is similar")
-        found = self._found(rows, view, learned=False)
+        learned = self._structure.confirms_depth(rows)
+        found = self._found(rows, view, learned)
         if isinstance(found, str):
-            found = self._found(rows, view, learned=True)
+            found = self._found(rows, view, not learned)
         if isinstance(found, str):
             return Localisation(name, reason=f"{len(rows)} similar places; {found}")
         away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)

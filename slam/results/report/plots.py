@@ -248,10 +248,7 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
     """
     what = _panels(what)
     if len(runs) > _MOST_COLUMNS:
-        raise RunError(
-            f"{len(runs)} runs are wider than a page, on which {_MOST_COLUMNS} have room: give their trajectory files, "
-            "which are drawn over each other, or compare them with 'erfsfm-slam evaluate'"
-        )
+        raise RunError(f"{len(runs)} runs are wider than a page: give {_MOST_COLUMNS}, or files, which share one figure")
     require_figure(output)
     contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
     heights = [*map(_height, what)]

@@ -140,6 +140,15 @@ def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> Fl
     return T_enu_world
 
 
+def misfits(
+    fixes: GpsFixes, T_enu_world: FloatArray, T_world_camera: FloatArray, stamps: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Horizontal distances of the path from the fixes ``(M,)``, the fixes' sigmas ``(M,)``, and the path's length."""
+    off = se3.apply(T_enu_world, fixes.antenna(T_world_camera, stamps)) - fixes.points
+    path_m = float(se3.path_distance(T_world_camera)[-1])
+    return np.linalg.norm(off[:, :2], axis=1), fixes.sigmas[:, 0], path_m
+
+
 def positions_at_frames(
     fixes: GpsFixes, T_enu_world: FloatArray, T_world_camera: FloatArray, stamps: FloatArray
 ) -> list[MeasuredPosition]:

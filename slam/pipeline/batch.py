@@ -15,12 +15,14 @@ from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
+from slam.frontend import agreement
+from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive, Examples
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
+from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, lidar_steps
 from slam.frontend.network_factors import chain_raw
-from slam.frontend.scale.metric_scale import Scale, find_scale
+from slam.frontend.scale.metric_scale import Scale, find_scale, height_by_lidar
 from slam.frontend.scale.scale_estimate import (
     ScaleEstimate,
     resolve_mode,
@@ -42,7 +44,7 @@ from slam.pipeline.keyframe_depth import KeyframeDepths
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
-from slam.runtime.errors import SequenceError
+from slam.runtime.errors import SequenceError, SlamError
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
@@ -142,7 +144,11 @@ class SlamPipeline:
         T_network = chain_raw(drive.snippets, len(drive))
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence, self._progress)
-        scale, factors, T_odometry = self._measure(drive, T_network, lidar)
+        steps = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
+        agreements = self._compared(drive, steps, state)
+        if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
+            steps = []
+        scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         if closure is None:
             with self._watch.stage("loops"):
@@ -151,6 +157,9 @@ class SlamPipeline:
         else:
             loops = closure.closures(scale)
         graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
+        if self._positioning is not None and self._positioning.agreement is not None:
+            by_gps = self._positioning.agreement
+            agreements.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
         reference = self._sequence.reference
         return Estimate(
             network=self._trajectory(T_network),
@@ -168,13 +177,35 @@ class SlamPipeline:
             location=location,
             first=self.first,
             stopwatch=self._watch,
+            agreements=tuple(agreements),
         )
 
+    def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:
+        """LiDAR and depth from elsewhere beside the images; ``SlamError`` where lengths by LiDAR alone are wrong."""
+        by_steps, height = (
+            agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated),
+            height_by_lidar(steps, drive),
+        )
+        by_height = (
+            agreement.of_height(LIDAR_SOURCE, height, self._sequence.camera_height_m, 0.0)
+            if height is not None
+            else None
+        )
+        both = [each for each in (by_steps, by_height) if each is not None]
+        found = [max(both, key=lambda each: each.sigmas, default=None)]
+        if self._config.depth.source != "network":
+            found.append(agreement.of_depth(self._config.depth.source, state.odometry.depth_error))
+        compared = [each.said() for each in found if each is not None]
+        wrong = [each for each in compared if each.is_wrong and (self.mode == "lidar" or each.source != LIDAR_SOURCE)]
+        if wrong:
+            raise SlamError(f"{wrong[0]}; check its files and settings, or run without it")
+        return compared
+
     def _measure(
-        self, drive: Drive, T_network: FloatArray, lidar: LidarPath | MeasurementFailure | None
+        self, drive: Drive, T_network: FloatArray, by_lidar: Sequence[RelativePose], agreements: list[Agreement]
     ) -> tuple[Scale, list[RelativePose], FloatArray]:
         """Scale and factors of a completed drive, and the odometry ``(N, 4, 4)`` chained from the factors."""
-        config, by_lidar = self._config, lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
+        config = self._config
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
         warn_of_contradicted_steps(scale)
@@ -182,6 +213,11 @@ class SlamPipeline:
         T_odometry = chain_odometry(factors, T_network, scale)
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(T_odometry)
+            if isinstance(unit, ScaleEstimate) and isinstance(scale.estimate, ScaleEstimate):
+                stated, spread = self._sequence.camera_height_m, scale.estimate.spread
+                agreements.append(agreement.of_height(f"scale.mode={self.mode}", unit.value, stated, spread).said())
+                if agreements[-1].is_wrong:
+                    raise SlamError(f"{agreements[-1]}; give the right lengths, or another scale.mode")
             scale = scale.in_metres(unit)
             if isinstance(unit, ScaleEstimate):
                 factors = [factor.scaled(unit.value) for factor in factors]

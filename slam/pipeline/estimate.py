@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from slam.formats.trajectory import Trajectory
 from slam.frames import RelativePose, View
+from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
@@ -24,8 +25,8 @@ class Estimate:
 
     ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
     ``state`` is that of the front end, for a run that continues this one; frames before ``first`` are of earlier runs.
-    ``location`` is None without a GPS track, and the reason where the
-    track cannot be used.
+    ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
+    each optional source contradicts the images.
     """
 
     network: Trajectory
@@ -43,4 +44,5 @@ class Estimate:
     location: Location | MeasurementFailure | None
     first: int
     stopwatch: Stopwatch
+    agreements: tuple[Agreement, ...] = ()
     map: TsdfMap | None = None

@@ -6,7 +6,8 @@ import logging
 from dataclasses import dataclass
 
 from slam.config.sections import GpsConfig, ScaleMode
-from slam.frontend import gps
+from slam.frontend import agreement, gps
+from slam.frontend.agreement import Agreement
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.geometry.geodesy import GpsTrack
@@ -39,7 +40,8 @@ class Positioning:
         fixes = gps.fixes_of(track, stamps, config)
         if isinstance(fixes, MeasurementFailure):
             raise SlamError(fixes.reason)
-        self._fixes, self._stamps, self._config = fixes, stamps, config
+        self._fixes, self._stamps, self._config, self._mode = fixes, stamps, config, mode
+        self.agreement: Agreement | None = None
 
     def scale(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry ``(N, 4, 4)``."""
@@ -54,10 +56,20 @@ class Positioning:
             T_enu_world = scale
         else:
             T_enu_world = gps.align(self._fixes, T_world_camera, self._stamps)
+        if not isinstance(T_enu_world, MeasurementFailure):
+            T_enu_world = self._agreeing(T_enu_world, T_world_camera)
         if isinstance(T_enu_world, MeasurementFailure):
             logger.warning("the GPS track is not used: %s", T_enu_world.reason)
             return T_enu_world
         return Location(self._fixes, T_enu_world)
+
+    def _agreeing(self, T_enu_world: FloatArray, T_world_camera: FloatArray) -> FloatArray | MeasurementFailure:
+        """The same pose, unless the fixes contradict the path; a run whose lengths are theirs is then refused."""
+        found = agreement.of_positions("GPS", *gps.misfits(self._fixes, T_enu_world, T_world_camera, self._stamps))
+        self.agreement = found
+        if found.is_wrong and self._mode == "gps":
+            raise SlamError(f"{found}; give the track and gps.offset_s of this drive, or another scale.mode")
+        return MeasurementFailure(str(found)) if found.is_wrong else T_enu_world
 
     def add_factors(self, graph: PoseGraph, location: Location, T_odometry: FloatArray) -> None:
         """Add the fixes to a graph, unless they are only for comparison."""

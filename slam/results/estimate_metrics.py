@@ -25,6 +25,7 @@ from slam.pipeline.estimate import Estimate
 from slam.results.folder import RunFolder
 from slam.results.gps import gps_metrics
 from slam.results.metrics import (
+    AgreementMetrics,
     CoverageMetrics,
     Event,
     GraphMetrics,
@@ -60,6 +61,7 @@ def estimate_metrics(
         sequence=_sequence(result, sequence),
         timing=timing_of(result.stopwatch, len(sequence) - result.first),
         scale=_scale(result),
+        agreement=[AgreementMetrics(**asdict(each)) for each in result.agreements],
         trajectories=Trajectories(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),

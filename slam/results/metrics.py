@@ -91,6 +91,14 @@ class ScaleMetrics(Record):
     contradicted_steps: Known[Count] = MISSING
 
 
+class AgreementMetrics(Record):
+    """How far an optional source contradicts the images, in sigmas of its noise, and what that is."""
+
+    source: str
+    sigmas: Known[float] = MISSING
+    figure: Known[str] = MISSING
+
+
 class Trajectories(Record):
     """Errors by trajectory."""
 
@@ -245,6 +253,7 @@ class Metrics(Record):
     sequence: Known[SequenceMetrics] = MISSING
     timing: Known[Timing] = MISSING
     scale: Known[ScaleMetrics] = MISSING
+    agreement: Known[list[AgreementMetrics]] = MISSING
     trajectories: Known[Trajectories] = MISSING
     gps: Known[GpsMetrics] = MISSING
     graph: Known[GraphMetrics] = MISSING

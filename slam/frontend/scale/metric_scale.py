@@ -95,7 +95,7 @@ def find_scale(
     metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
-        height = _height_by_lidar(metres, drive) or camera_height_m
+        height = height_by_lidar(lidar_steps, drive) or camera_height_m
     unit = 1.0 if height is None else height
     absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in drive.road_steps.items()}
     if mode == "lidar":
@@ -142,8 +142,9 @@ def _measured_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, 
     return {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
 
 
-def _height_by_lidar(metres: Mapping[Ends, float], drive: Drive) -> float | None:
+def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
     """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
+    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:

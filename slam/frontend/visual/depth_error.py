@@ -96,6 +96,15 @@ class DepthError:
     def _spread(self) -> FloatArray:
         return np.maximum(0.5 * (self._quantile(0.84) - self._quantile(0.16)), _LEAST_SIGMA)
 
+    @property
+    def total_spread(self) -> float | None:
+        """Half of the range that holds two thirds of all logarithms; None where the drive showed few corners."""
+        counts = self.corners.sum(axis=0)
+        if counts.sum() < _PRIOR_CORNERS:
+            return None
+        low, high = np.interp([0.16, 0.84], np.cumsum(counts) / counts.sum(), _LOGARITHMS)
+        return float(high - low) / 2
+
     def _quantile(self, share: float) -> FloatArray:
         """Quantile of the logarithms at each depth ``(D,)``, linear within their steps."""
         prior = np.exp(-0.5 * (_LOGARITHMS / _PRIOR_SIGMA) ** 2)

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-
 _STYLE = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
@@ -248,10 +247,7 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
     """
     what = _panels(what)
     if len(runs) > _MOST_COLUMNS:
-        raise RunError(
-            f"{len(runs)} runs are wider than a page, on which {_MOST_COLUMNS} have room: give their trajectory files, "
-            "which are drawn over each other, or compare them with 'erfsfm-slam evaluate'"
-        )
+        raise RunError(f"{len(runs)} runs are wider than a page: give {_MOST_COLUMNS}, or files, which share a figure")
     require_figure(output)
     contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
     heights = [*map(_height, what)]
@@ -287,8 +283,7 @@ def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, 
 
 def length_unit(run: RunFolder) -> str:
     """The unit of a run's trajectories and map, for the axes of a plot."""
-    unit = run.metrics().unit
-    return "m" if unit == METRES else unit
+    return "m" if (unit := run.metrics().unit) == METRES else unit
 
 
 @contextmanager

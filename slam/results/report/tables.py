@@ -22,7 +22,7 @@ from slam.results.error_columns import (
     Errors,
     written,
 )
-from slam.results.metrics import GpsErrors, LoopsFile, Metrics, Stretch
+from slam.results.metrics import AgreementMetrics, GpsErrors, LoopsFile, Metrics, Stretch
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import METRICS, TRAJECTORIES
 from slam.runtime.storage.record import NOT_RECORDED, Missing, known
@@ -101,6 +101,7 @@ def what_ran(metrics: Metrics) -> Table:
         ("True length", text(sequence.length_m, unit=" m")),
         ("Frame rate", text(sequence.fps, unit=" frames/s")),
         ("Scale", f"mode {text(scale.mode)}, value {text(scale.value, 4)}"),
+        *((f"{each.source} beside the images", _agreement(each)) for each in known(metrics.agreement) or ()),
         ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
         ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
         ("Noise of the poses", noise if DASH in noise else f"noise.yaml, sha256 {noise}"),
@@ -114,6 +115,10 @@ def what_ran(metrics: Metrics) -> Table:
     ]
     recorded = [row for row in rows if NOT_RECORDED not in row[1]] if metrics.failure else rows
     return Table((), _texts(recorded), "words")
+
+
+def _agreement(found: AgreementMetrics) -> str:
+    return f"{written(known(found.sigmas), 1)} sigmas: {known(found.figure)}"
 
 
 def gps(metrics: Metrics) -> Table | None:

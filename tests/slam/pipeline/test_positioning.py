@@ -108,6 +108,20 @@ def test_a_track_that_does_not_fit_is_refused() -> None:
         run(None, "scale.mode=gps")
 
 
+@pytest.mark.parametrize("change", ["backwards", "late"])
+def test_fixes_of_another_drive_are_left_out_or_refused(change: str, caplog: pytest.LogCaptureFixture) -> None:
+    gps = track(np.random.default_rng(0), 0.0)
+    places = gps.places[::-1] if change == "backwards" else np.roll(gps.places, 30, axis=0)
+    other = GpsTrack(gps.stamps, places, gps.dilution)
+    settings = ("gps.sigma_m=0.2", "gps.vertical_sigma_m=0.2")
+    result = run(other, *settings, "scale.mode=reference")
+    found = result.agreements[-1]
+    assert found.source == "GPS" and found.is_wrong and isinstance(result.location, MeasurementFailure)
+    assert caplog.text.count("GPS contradicts the images by") == 1
+    with pytest.raises(SlamError, match="contradicts the images by"):
+        run(other, *settings, "scale.mode=gps")
+
+
 def test_a_camera_that_stands_is_not_located() -> None:
     gps = track(np.random.default_rng(0), 0.0)
     result = run(GpsTrack(gps.stamps, np.tile(PLACE, (len(gps.stamps), 1)), gps.dilution))

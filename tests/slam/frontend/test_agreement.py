@@ -1,0 +1,62 @@
+"""Sources that contradict the images are told from those that agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from slam.frames import RelativePose
+from slam.frontend import agreement
+from slam.frontend.lidar_odometry import LidarPath, lidar_steps
+from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.motion import Motion
+from slam.geometry import se3
+
+FRAMES = 40
+TURNS = np.column_stack([np.zeros(FRAMES), np.full(FRAMES, 0.02), np.zeros(FRAMES)])
+STEPS = se3.from_rotation_vector(TURNS, np.tile([0.0, 0.0, 0.9], (FRAMES, 1)))
+SWAPPED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def noisy(T: np.ndarray) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return T @ se3.from_rotation_vector(rng.normal(0, 1e-3, (len(T), 3)), rng.normal(0, 0.02, (len(T), 3)))
+
+
+@pytest.mark.parametrize(
+    ("made", "least"),
+    [
+        (noisy, 0),
+        (lambda T: np.tile(np.eye(4), (len(T), 1, 1)), agreement.DOUBTFUL),  # the same scan always
+        (lambda T: SWAPPED @ T @ se3.invert(SWAPPED), agreement.WRONG),
+        (se3.invert, agreement.WRONG),  # the drive backwards
+    ],
+)
+def test_lidar_is_compared_with_the_steps_of_the_images(made: Callable[[np.ndarray], np.ndarray], least: float) -> None:
+    motions = {
+        (k, k + 1): Motion(RelativePose(k, k + 1, T, np.full(6, 0.01), "essential"), np.full(3, 0.01))
+        for k, T in enumerate(STEPS)
+    }
+    path = LidarPath(np.arange(FRAMES + 1), se3.chain(made(STEPS)))
+    found = agreement.of_steps("lidar", lidar_steps(path), motions)
+    assert found is not None and found.sigmas > least
+    assert least or found.sigmas < 1
+
+
+@pytest.mark.parametrize(
+    ("implied", "stated", "is_wrong"),
+    [(1.6, 1.65, False), (1650.0, 1.65, True), (0.0, 1.65, True), (0.0, None, True), (12.0, None, False)],
+)
+def test_lengths_are_compared_with_the_camera_height(implied: float, stated: float | None, is_wrong: bool) -> None:
+    found = agreement.of_height("scale.mode=known", implied, stated, 0.02)
+    assert found.is_wrong == is_wrong and (is_wrong or found.sigmas < agreement.DOUBTFUL)
+
+
+def test_disparity_that_is_read_as_depth_is_doubtful() -> None:
+    true = np.exp(np.random.default_rng(0).uniform(np.log(4), np.log(40), 400))
+    right, inverse = (DepthError().with_step(learned, 1 / true, 1.0) for learned in (true, 40 / true))
+    assert agreement.of_depth("png:depth", DepthError()) is None
+    sigmas = [found.sigmas for error in (right, inverse) if (found := agreement.of_depth("png:depth", error))]
+    assert sigmas[0] < 1 and sigmas[1] > agreement.DOUBTFUL

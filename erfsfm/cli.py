@@ -333,5 +333,5 @@ def calibrate_noise(
 
 def main() -> None:
     """Run the command line: known errors become one line and exit code 1."""
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    command_line.Terminal(logging.INFO)
     command_line.run(app, "erfsfm")

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import re
 import sys
 import traceback
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 import typer
 
@@ -22,6 +24,7 @@ SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 _LOADING_BYTES = 384 * 2**20  # of NumPy, OpenCV and SciPy: OpenBLAS waits for ever for memory that it cannot have
 # what they would say of a file is said in our own line
 _OPENCV = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
+_MOST_TIMES = 10
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _NOT_UTF8 = "is not in UTF-8: rename it, or set the environment variable LC_ALL to C.UTF-8"
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
@@ -34,6 +37,30 @@ _MEMORY = re.compile(
 )
 
 
+class Terminal(logging.StreamHandler[TextIO]):
+    """Standard error, to which a warning of one kind is said ten times, and then how often besides."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(sys.stderr)
+        self.setLevel(level)
+        self._times: Counter[str] = Counter()
+        logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[self])
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Say a record, unless it was said ten times."""
+        if record.levelno == logging.WARNING:
+            self._times[f"{record.name}: {record.msg}"] += 1
+        if self._times[f"{record.name}: {record.msg}"] <= _MOST_TIMES:
+            super().emit(record)
+
+    def count(self) -> None:
+        """Say what was not said."""
+        for kind, times in self._times.items():
+            if times > _MOST_TIMES:
+                _say(f"WARNING {kind.partition(':')[0]}: {times - _MOST_TIMES} more warnings of this kind")
+        self._times.clear()
+
+
 def run(app: Callable[..., object], name: str) -> None:
     """Run a command line on ``sys.argv``; a known error becomes one line on stderr and exit code 1."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -42,7 +69,12 @@ def run(app: Callable[..., object], name: str) -> None:
     try:
         require_memory(_LOADING_BYTES)
         _check_current_folder(name)
-        app(args=_checked(sys.argv[1:], name), prog_name=name)
+        try:
+            app(args=_checked(sys.argv[1:], name), prog_name=name)
+        finally:  # the last line is that of the error
+            for handler in logging.getLogger().handlers:
+                if isinstance(handler, Terminal):
+                    handler.count()
     except SystemExit as end:
         if end.code == _INTERRUPTED or isinstance(end, Terminated):
             why = str(end) if isinstance(end, Terminated) else "interrupted"

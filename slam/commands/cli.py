@@ -186,7 +186,5 @@ def _print_run(path: Path, metrics: Metrics) -> None:
 
 def main() -> None:
     """Run the command line: a known error becomes one line and exit code 1."""
-    terminal = logging.StreamHandler(sys.stderr)
-    terminal.setLevel(logging.WARNING)  # run.log has the rest
-    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", handlers=[terminal])
+    command_line.Terminal(logging.WARNING)  # run.log has the rest
     command_line.run(app, "erfsfm-slam")

@@ -56,6 +56,8 @@ def check_output(output: Path, drives: Sequence[Drive]) -> None:
     """
     if output.exists() and not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
+    for name in {drive.name for drive in drives} & {CSV, PAGE}:
+        raise RunError(f"a drive is named {name}, as a file of the batch: give it another name in the manifest")
     logs = [(f"{drive.name}.log", LOG_BEGIN) for drive in drives]
     for name, mark in ((CSV, ",".join(_FIRST)), (PAGE, "<title>erfsfm-slam: "), *logs):
         path = output / name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,15 @@ def outcome(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         return int(stopped.value.code or 0), capsys.readouterr().err
 
     return run
+
+
+def test_a_warning_that_repeats_is_counted() -> None:
+    program = "import logging, sys\nfrom erfsfm.common import command_line\ncommand_line.Terminal(logging.WARNING)\n"
+    program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('cache').warning('entry %d', k)\n"
+    program += " raise OSError('the error')\ncommand_line.run(app, 'program')"
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False).stderr
+    last = ["WARNING cache: entry 9", "WARNING cache: 101 more warnings of this kind", "program: the error"]
+    assert said.splitlines()[9:] == last
 
 
 @pytest.mark.parametrize("words", [("--output", ""), ("--output=",)])

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -139,6 +140,8 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
 def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, kitti_root: Path, name: str) -> None:
     drives = drives_of(kitti_root, ["all"], [])
     check_output(tmp_path, drives)
+    with pytest.raises(RunError, match=r"a drive is named index\.html"):
+        check_output(tmp_path, [replace(drives[0], name="index.html")])
     (tmp_path / name).write_text("my own")
     with pytest.raises(RunError, match=f"{name} is none of ours"):
         check_output(tmp_path, drives)

@@ -429,7 +429,7 @@ def test_every_camera_file_and_manifest_opens(block: Block, tmp_path: Path) -> N
 
 
 def test_every_fence_is_of_a_known_language() -> None:
-    known = (*SHELL, "python", "py", "yaml", "yml", "text", "bibtex")
+    known = (*SHELL, "python", "py", "yaml", "yml", "text", "bibtex", "toml")
     every = [block for document in DOCUMENTS for block in fenced(document)]
     strange = [f"{block} {block.language}" for block in every if block.language not in known]
     assert not strange, "say here how to run them, or call them text"

@@ -10,7 +10,9 @@ from typer.testing import CliRunner
 
 from erfsfm.cli import app
 from erfsfm.inference import DepthPosePredictor
-from slam.simulation.street import SimulatedStreet, parse_options, write_kitti_root
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import parse_options
+from slam.simulation.street import SimulatedStreet
 
 SMALL = ("steps=2", "batch=2", "validate_every=2")
 SMALL_DATA = ("workers=0", "validation_share=0.45", "validation_snippets=1")

@@ -212,6 +212,7 @@ def test_what_does_not_fit_is_refused(
     (output / DRIVE).write_bytes(b"PK")
     with pytest.raises(RunError, match=r"drive\.zip is damaged"):
         run_slam(continues=output)
+    (output / DRIVE).unlink()
     metrics = json.loads((output / "metrics.json").read_text())
     metrics["provenance"]["recording"]["dataset"] = str(tmp_path / "nowhere")
     (output / "metrics.json").write_text(json.dumps(metrics))

@@ -101,8 +101,10 @@ class DepthConfig(Section):
     @classmethod
     def _known_source(cls, source: str) -> str:
         kind, colon, path = source.partition(":")
+        if source == "network" or (kind in DEPTH_SOURCES and colon and path):
+            return source
         others = plug_ins(DEPTH_PLUG_INS)
-        if source != "network" and not (kind in (*DEPTH_SOURCES, *others) and colon and path):
+        if not (kind in others and colon and path):
             raise ValueError(", ".join(("network, onnx:FILE, npy:FOLDER or png:FOLDER", *(f"{n}:..." for n in others))))
         return source
 

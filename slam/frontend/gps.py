@@ -140,13 +140,9 @@ def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> Fl
     return T_enu_world
 
 
-def misfits(
-    fixes: GpsFixes, T_enu_world: FloatArray, T_world_camera: FloatArray, stamps: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Horizontal distances of the path from the fixes ``(M,)``, the fixes' sigmas ``(M,)``, and the path's length."""
-    off = se3.apply(T_enu_world, fixes.antenna(T_world_camera, stamps)) - fixes.points
-    path_m = float(se3.path_distance(T_world_camera)[-1])
-    return np.linalg.norm(off[:, :2], axis=1), fixes.sigmas[:, 0], path_m
+def offsets(fixes: GpsFixes, T_enu_camera: FloatArray, stamps: FloatArray) -> FloatArray:
+    """From the fixes to the antenna of the path at their times ``(M, 3)``, east, north and up."""
+    return fixes.antenna(T_enu_camera, stamps) - fixes.points
 
 
 def positions_at_frames(

@@ -38,3 +38,20 @@ def triangulate(
     angle = np.zeros(count)
     np.maximum.at(angle, point, np.arccos(np.clip(cosine, -1.0, 1.0)))
     return X, angle
+
+
+def reprojection_errors(
+    T_camera_world: FloatArray, points: FloatArray, rays: FloatArray, focal: tuple[float, float]
+) -> FloatArray:
+    """Distances in pixels ``(S,)`` between sightings and their points; infinite behind a camera.
+
+    Args:
+        T_camera_world: of each sighting ``(S, 4, 4)``.
+        points: of each sighting ``(S, 3)``.
+        rays: of each sighting in its camera ``(S, 3)``, z = 1.
+        focal: lengths along both axes, pixels.
+    """
+    X = np.einsum("sij,sj->si", T_camera_world[:, :3, :3], points) + T_camera_world[:, :3, 3]
+    in_front = X[:, 2] > 0
+    offset = (X[:, :2] / np.where(in_front, X[:, 2], 1.0)[:, None] - rays[:, :2]) * focal
+    return np.where(in_front, np.linalg.norm(offset, axis=1), np.inf)

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.geometry.triangulation import triangulate
+from slam.geometry.triangulation import reprojection_errors, triangulate
 from slam.loops.places import Places
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import matches
@@ -20,7 +20,6 @@ from slam.loops.verification import matches
 _NEIGHBOURS = 4  # places on either side that a place is matched with
 _LEAST_SIGHTINGS = 3
 _LEAST_ANGLE = np.deg2rad(1.0)  # between two rays of a point
-_LEAST_DEPTH = 1e-6
 _LARGEST_DEPTH_ERROR = 0.2  # of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
 
 Rows = NDArray[np.intp]
@@ -47,6 +46,9 @@ class PlaceStructure:
         self._places, self._thresholds = places, thresholds
         self._T_camera_world = invert(places.T_world_camera)
         self._around = cache(self._triangulated_around)
+        self._first = np.cumsum([0, *map(len, places.views)])
+        pixels = [np.zeros((0, 2)), *(view.pixels.astype(np.float64) for view in places.views)]
+        self._pixels: FloatArray = np.concatenate(pixels)
 
     def points(self, row: int, learned: bool) -> FloatArray:
         """Points ``(M, 3)`` of the corners of a place, NaN where unknown; ``learned``: with those of learned depth."""
@@ -55,6 +57,11 @@ class PlaceStructure:
             return points
         by_depth = apply(self._places.T_world_camera[row], self._places.views[row].points.astype(np.float64))
         return np.where(np.isfinite(points), points, by_depth)
+
+    def pixels(self, views: Rows, corners: Rows) -> FloatArray:
+        """Where places ``(S,)`` see their corners ``(S,)``, ``(S, 2)``."""
+        pixels: FloatArray = self._pixels[self._first[views] + corners]
+        return pixels
 
     def confirms_depth(self, rows: Sequence[int]) -> bool:
         """Whether learned depth of these places agrees with triangulation, as on streets; true where none tells."""
@@ -69,7 +76,7 @@ class PlaceStructure:
 
     def tracks(self) -> Tracks:
         """Corners of all places joined to points that three or more of them see."""
-        first = np.cumsum([0, *map(len, self._places.views)])
+        first = self._first
         around = [self._around(row) for row in range(len(self._places.views))]
         known = [np.isfinite(each.points[each.point, 0]) for each in around]
         ends = [
@@ -104,25 +111,16 @@ class PlaceStructure:
             count: points.
         """
         intrinsics, allowed_px = self._places.intrinsics, self._thresholds.reprojection_px
-        pixels = np.concatenate([view.pixels for view in self._places.views]).astype(np.float64)
-        first = np.cumsum([0, *map(len, self._places.views)])
-        pixels = pixels[first[views] + corners]
+        rays, focal = intrinsics.rays(self.pixels(views, corners)), (intrinsics.fx, intrinsics.fy)
         for tolerance in (2.0, 1.0, 1.0):  # wrong matches spoil the first points
-            points, _ = triangulate(self._T_camera_world[views], intrinsics.rays(pixels), point, count)
-            error = self._errors(views, points[point], pixels)
-            kept = error < tolerance * allowed_px
-            views, corners, point, pixels = views[kept], corners[kept], point[kept], pixels[kept]
-        points, angle = triangulate(self._T_camera_world[views], intrinsics.rays(pixels), point, count)
-        error = self._errors(views, points[point], pixels)
+            T = self._T_camera_world[views]
+            points, _ = triangulate(T, rays, point, count)
+            kept = reprojection_errors(T, points[point], rays, focal) < tolerance * allowed_px
+            views, corners, point, rays = views[kept], corners[kept], point[kept], rays[kept]
+        T = self._T_camera_world[views]
+        points, angle = triangulate(T, rays, point, count)
+        error = reprojection_errors(T, points[point], rays, focal)
         kept = error < allowed_px
         confirmed = np.bincount(point[kept], minlength=count) >= _LEAST_SIGHTINGS
         points[~confirmed | (angle < _LEAST_ANGLE)] = np.nan
         return Tracks(points, views[kept], corners[kept], point[kept], error[kept])
-
-    def _errors(self, views: Rows, points: FloatArray, pixels: FloatArray) -> FloatArray:
-        """Reprojection error of each sighting, pixels; infinite behind a camera."""
-        T = self._T_camera_world[views]
-        X = np.einsum("sij,sj->si", T[:, :3, :3], points) + T[:, :3, 3]
-        ahead = X[:, 2] > _LEAST_DEPTH
-        X[~ahead] = 1.0
-        return np.where(ahead, np.linalg.norm(self._places.intrinsics.project(X) - pixels, axis=1), np.inf)

@@ -182,17 +182,11 @@ class SlamPipeline:
 
     def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:
         """LiDAR and depth from elsewhere beside the images; ``SlamError`` where lengths by LiDAR alone are wrong."""
-        by_steps, height = (
-            agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated),
-            height_by_lidar(steps, drive),
-        )
-        by_height = (
-            agreement.of_height(LIDAR_SOURCE, height, self._sequence.camera_height_m, 0.0)
-            if height is not None
-            else None
-        )
-        both = [each for each in (by_steps, by_height) if each is not None]
-        found = [max(both, key=lambda each: each.sigmas, default=None)]
+        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated)]
+        height = height_by_lidar(steps, drive)
+        if height is not None:
+            by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self._sequence.camera_height_m, 0.0))
+        found = [max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)]
         if self._config.depth.source != "network":
             found.append(agreement.of_depth(self._config.depth.source, state.odometry.depth_error))
         compared = [each.said() for each in found if each is not None]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from slam.formats.trajectory import Trajectory
-from slam.frames import RelativePose, View
+from slam.frames import Intrinsics, RelativePose, View
 from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
@@ -13,6 +15,7 @@ from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale.metric_scale import Scale
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
+from slam.loops.places import Places
 from slam.mapping.map import TsdfMap
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.positioning import Location
@@ -46,3 +49,8 @@ class Estimate:
     stopwatch: Stopwatch
     agreements: tuple[Agreement, ...] = ()
     map: TsdfMap | None = None
+
+    def places(self, intrinsics: Intrinsics) -> Places:
+        """Every view with its points at the poses of the optimised trajectory, and the camera."""
+        frames = np.array([view.index for view in self.views], dtype=np.intp)
+        return Places(intrinsics, tuple(self.views), self.optimised.select(frames).T_world_camera)

@@ -17,7 +17,6 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
-from slam.loops.places import Places
 from slam.loops.structure import PlaceStructure
 from slam.loops.thresholds import OF_KEYFRAMES
 from slam.pipeline.batch import SlamPipeline
@@ -270,13 +269,13 @@ class Slam:
 
         Those of a hand-held camera are triangulated among neighbouring keyframes, those of a drive have learned depth.
         """
-        estimate, T_world_camera = self._solved(), self.keyframes().T_world_camera
+        estimate = self._solved()
+        places = estimate.places(self._sequence.intrinsics)
         if estimate.drive.maps:
-            places = Places(self._sequence.intrinsics, tuple(estimate.views), T_world_camera)
             structure = PlaceStructure(places, OF_KEYFRAMES)
-            of_views = [structure.points(row, learned=False) for row in range(len(estimate.views))]
+            of_views = [structure.points(row, learned=False) for row in range(len(places.views))]
         else:
-            pairs = zip(T_world_camera, estimate.views, strict=True)
+            pairs = zip(places.T_world_camera, places.views, strict=True)
             of_views = [apply(T, view.points.astype(np.float64)) for T, view in pairs]
         points = np.concatenate(of_views)
         known: FloatArray = points[np.isfinite(points).all(axis=1)]

@@ -44,8 +44,7 @@ class Observer:
     result is collected with the next frame, so results do not depend on the timing of threads.
 
     With ``depth.frame_stride`` above 1, depth is carried to the frames between by the measured motion, and snippets
-    touch. While keyframes alone measure the camera, depth is predicted for them and the targets of snippets, which
-    touch.
+    touch. While keyframes alone measure the camera, depth is predicted for them and for the targets of snippets.
     """
 
     def __init__(

@@ -5,13 +5,15 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
+import numpy as np
+
 from slam.config.sections import GpsConfig, ScaleMode
 from slam.frontend import agreement, gps
 from slam.frontend.agreement import Agreement
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.geometry.geodesy import GpsTrack
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, path_distance
 from slam.graph.pose_graph import PoseGraph
 from slam.runtime.errors import SlamError
 
@@ -65,7 +67,9 @@ class Positioning:
 
     def _agreeing(self, T_enu_world: FloatArray, T_world_camera: FloatArray) -> FloatArray | MeasurementFailure:
         """The same pose, unless the fixes contradict the path; a run whose lengths are theirs is then refused."""
-        found = agreement.of_positions("GPS", *gps.misfits(self._fixes, T_enu_world, T_world_camera, self._stamps))
+        apart = gps.offsets(self._fixes, T_enu_world @ T_world_camera, self._stamps)
+        distances, path_m = np.linalg.norm(apart[:, :2], axis=1), float(path_distance(T_world_camera)[-1])
+        found = agreement.of_positions("GPS", distances, self._fixes.sigmas[:, 0], path_m)
         self.agreement = found
         if found.is_wrong and self._mode == "gps":
             raise SlamError(f"{found}; give the track and gps.offset_s of this drive, or another scale.mode")

@@ -48,8 +48,7 @@ def write_places(folder: RunFolder, result: Estimate, name: str) -> None:
 
 
 def _errors(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> GpsErrors:
-    antenna = fixes.antenna(T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
-    apart = antenna - fixes.points
+    apart = gps.offsets(fixes, T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
     level = np.linalg.norm(apart[:, :2], axis=1)
     return GpsErrors(
         horizontal_rmse_m=float(np.sqrt((level**2).mean())),

@@ -1,165 +1,224 @@
-"""Procedural textures of rooms: paint, tiles, boards, carpets, wood, books, pictures, screens, windows and cartons."""
+"""Surfaces of a house: floors, walls, doorways, windows, lamps and the furniture of every room."""
+
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from slam.simulation.geometry import Float32Array, Material
-from slam.simulation.noise import Lengths, Texels, band, cell_hash, fractal, mix, stripes
+from slam.simulation import furniture
+from slam.simulation.geometry import FLAT, FloatArray, Material, Mesh, Soup
+from slam.simulation.house import DOOR_HEIGHT, WALL, House, Rectangle, Room
+from slam.simulation.objects import colour, frame_at
 
-GLOWING = {Material.SCREEN: 1.3, Material.PANE: 2.2, Material.LAMP: 2.5}  # light of their own
-_INK = np.array([[0.12], [0.12], [0.14]], dtype=np.float32)
-
-
-def _size(texels: Texels) -> Float32Array:
-    return np.maximum(texels.u_size, texels.v_size)
-
-
-def _rim(texels: Texels, width: Lengths, height: Lengths, border: Lengths | float) -> Float32Array:
-    """Coverage by the border of a rectangle that begins at the origin."""
-    inside = band(texels.u, texels.u_size, border, width - border)
-    return np.asarray(1.0 - inside * band(texels.v, texels.v_size, border, height - border))
+_WALLS = ((0.86, 0.84, 0.79), (0.80, 0.82, 0.84), (0.78, 0.72, 0.60), (0.66, 0.72, 0.68), (0.74, 0.62, 0.56))
+_AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
+_DEEPEST = 0.65  # piece at a wall, metres
+_STEP = 0.5  # between the vertices of walls, which carry the light, metres
 
 
-def _text(texels: Texels, line: Lengths | float, letter: float) -> Float32Array:
-    """Coverage by lines of words."""
-    row = np.floor(texels.v / line)
-    word = cell_hash(texels.u / letter + texels.shift, row + texels.shift_v, 7) > 0.35
-    near = np.clip(letter / _size(texels) - 0.7, 0.0, 1.0)
-    written = word * near + 0.65 * (1.0 - near)
-    return np.asarray(stripes(texels.v, texels.v_size, line, 0.55 * line) * written)
+@dataclass(frozen=True)
+class Interior:
+    """A furnished house.
+
+    Attributes:
+        mesh: all surfaces.
+        obstacles: what stands on the floors, in plan.
+        lights: position and strength of lamps and windows, ``(L, 4)``.
+    """
+
+    mesh: Mesh
+    obstacles: list[Rectangle]
+    lights: FloatArray
 
 
-def _plaster(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    skirting, period, contrast = parameters[:3]
-    grain = fractal(texels, (2.3, 1.9, 0.02), (0.4, 0.4, 0.012), (0.05, 0.05, 0.02), (0.015, 0.015, 0.02))
-    figure = stripes(texels.u, texels.u_size, np.maximum(period, 0.05), 0.4 * np.maximum(period, 0.05)) * (period > 0)
-    rgb = colours[0] * (1.0 + grain - contrast * figure)
-    return mix(rgb, colours[1] * (1.0 + grain), band(texels.v, texels.v_size, -1.0, skirting) * (skirting > 0))
+def furnish(house: House, seed: int) -> Interior:
+    """Walls, furniture and lamps of a house."""
+    furnisher = _Furnisher(house, np.random.default_rng([seed, 51]))
+    for room in house.rooms:
+        furnisher.room(room)
+    for door in house.doors:
+        furnisher.doorway(door)
+    return Interior(furnisher.soup.finish(FLAT), furnisher.obstacles, np.array(furnisher.lights))
 
 
-def _tiles(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    side, joint = parameters[0], parameters[1]
-    joints = np.maximum(stripes(texels.u, texels.u_size, side, joint), stripes(texels.v, texels.v_size, side, joint))
-    near = np.clip(side / _size(texels) / 2.0 - 0.5, 0.0, 1.0)
-    tone = 0.07 * near * (cell_hash(texels.u / side, texels.v / side, 1) - 0.5)
-    grain = fractal(texels, (0.5, 0.4, 0.03), (0.06, 0.05, 0.03))
-    chequered = (np.floor(texels.u / side) + np.floor(texels.v / side)) % 2 * parameters[2] * near
-    return mix(mix(colours[0] * (1.0 + grain + tone), 0.5 * colours[1], chequered), colours[1], joints)
+class _Furnisher:
+    """The mesh under construction."""
 
+    def __init__(self, house: House, rng: np.random.Generator) -> None:
+        self.house, self.rng, self.soup = house, rng, Soup(rng)
+        self.obstacles: list[Rectangle] = []
+        self.lights: list[tuple[float, float, float, float]] = []
+        self.frame_look = self.soup.instance(Material.WOOD, colour(rng, *furniture.WOODS))
+        self.skirting = colour(rng, (0.85, 0.84, 0.80), *furniture.WOODS)
 
-def _boards(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    width = parameters[0]
-    row = np.floor(texels.v / width)
-    along = np.asarray(texels.u + 0.9 * cell_hash(row, row, 2), dtype=np.float32)
-    near = np.clip(width / texels.v_size - 1.0, 0.0, 1.0)
-    tone = 0.3 * near * (cell_hash(np.divide(along, 0.9, dtype=np.float32), row, 4) - 0.5)
-    veins = fractal(texels, (0.9, 0.06, 0.1), (0.25, 0.02, 0.12), (0.08, 0.008, 0.1))
-    gaps = np.maximum(stripes(texels.v, texels.v_size, width, 0.006), stripes(along, texels.u_size, 0.9, 0.006))
-    return np.asarray(colours[0] * (1.0 + tone + veins) * (1.0 - 0.55 * gaps))
+    def room(self, room: Room) -> None:
+        """Everything inside the walls of a room."""
+        x0, y0, x1, y1 = room.area
+        east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
+        self._panel(np.array([x0, y0, 0.0]), east, north, self._floor(room))
+        ceiling = self.soup.instance(Material.PLASTER, colour(self.rng, (0.88, 0.88, 0.86), spread=0.02))
+        self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
+        wall = self._wall(room)
+        for number in range(4):
+            self._enclose(room, number, wall)
+            self._furnish(room, number)
+        self._fill_middle(room)
+        self._lamps(room)
 
+    def doorway(self, door: Rectangle) -> None:
+        """Jambs, lintel and threshold of an opening."""
+        x0, y0, x1, y1 = door
+        east, north, up = np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0]), np.array([0, 0, DOOR_HEIGHT])
+        corner = np.array([x0, y0, 0.0])
+        if x1 - x0 > WALL + 0.01:
+            self.soup.quad(corner, north, up, self.frame_look)
+            self.soup.quad(corner + east + north, -north, up, self.frame_look)
+        else:
+            self.soup.quad(corner + east, -east, up, self.frame_look)
+            self.soup.quad(corner + north, east, up, self.frame_look)
+        self.soup.quad(corner + up, north, east, self.frame_look)
+        self.soup.quad(corner, east, north, self.frame_look)
 
-def _carpet(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    width, height, motif = parameters[:3]
-    u, v = texels.u - 0.5 * width, texels.v - 0.5 * height
-    lozenge = np.abs((u / motif) % 1.0 - 0.5) + np.abs((v / motif) % 1.0 - 0.5)
-    soft = _size(texels) / motif
-    figure = np.clip((0.3 - lozenge) / np.maximum(soft, 0.02) + 0.5, 0.0, 1.0) * np.clip(0.7 / soft - 1.0, 0.0, 1.0)
-    border = _rim(texels, width, height, 0.18) - _rim(texels, width, height, 0.08)
-    grain = 1.0 + fractal(texels, (0.3, 0.3, 0.08), (0.03, 0.03, 0.12), (0.01, 0.01, 0.15))
-    return mix(colours[0], colours[1], np.maximum(figure, border)) * grain
+    def _floor(self, room: Room) -> int:
+        rng = self.rng
+        if room.kind in ("living", "bedroom", "office"):
+            return self.soup.instance(Material.BOARDS, colour(rng, *furniture.WOODS), None, (rng.uniform(0.07, 0.16),))
+        side = float(rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5))
+        tone = colour(rng, (0.62, 0.60, 0.57), (0.50, 0.51, 0.53), (0.68, 0.58, 0.46))
+        chequered = float(room.kind in ("bath", "kitchen") and rng.random() < 0.4)
+        return self.soup.instance(Material.TILES, tone, 0.75 * tone, (side, 0.008, chequered))
 
+    def _wall(self, room: Room) -> int:
+        rng = self.rng
+        tone = colour(rng, *_WALLS, spread=0.04)
+        if room.kind == "bath":
+            return self.soup.instance(Material.TILES, tone, 0.8 * tone, (float(rng.uniform(0.1, 0.25)), 0.006))
+        papered = float(rng.uniform(0.1, 0.3)) if rng.random() < 0.2 else 0.0
+        return self.soup.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
 
-def _wood(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    width, height = np.where(parameters[:2] > 0.0, parameters[:2], 9.0)  # of a door
-    veins = fractal(texels, (0.03, 0.5, 0.09), (0.01, 0.25, 0.08), (0.3, 1.1, 0.1))
-    gaps = np.maximum(stripes(texels.u, texels.u_size, width, 0.008), stripes(texels.v, texels.v_size, height, 0.008))
-    knob = np.hypot(texels.u % width - 0.87 * width, texels.v % height - 0.5 * height)
-    knobs = np.clip((0.022 - knob) / _size(texels) + 0.5, 0.0, 1.0) * (width < 9.0)
-    return mix(colours[0] * (1.0 + veins) * (1.0 - 0.6 * gaps), colours[1], knobs)
+    def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
+        """A parallelogram with vertices at most ``_STEP`` apart, textured in metres from its corner."""
+        width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
+        a, b = (np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height))
+        points = corner + a[None, :, None] * along + b[:, None, None] * up
+        u, v = np.meshgrid(a * width, b * height + corner[2] * (up[2] > 0.0))
+        self.soup.patch(points, np.stack([u, v], axis=2), look)
 
+    def _enclose(self, room: Room, number: int, look: int) -> None:
+        """One wall around its doors, seen from inside."""
+        (x, y), angle, length = room.side(number)
+        ahead, up = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([0.0, 0.0, 1.0])
+        edges = [0.0, *np.ravel(self.house.openings(room, number)), length]
+        for k, (start, end) in enumerate(pairwise(edges)):
+            low = DOOR_HEIGHT * (k % 2)
+            self._panel(np.array([x, y, low]) + end * ahead, (start - end) * ahead, (room.height - low) * up, look)
 
-def _fabric(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    grain = fractal(texels, (0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12))
-    return np.asarray(colours[0] * (1.0 + grain))
+    def _furnish(self, room: Room, number: int) -> None:
+        """Furniture along one wall, pictures above it and windows in it."""
+        rng = self.rng
+        (x, y), angle, length = room.side(number)
+        doors = [(a - 0.35, b + 0.35) for a, b in self.house.openings(room, number)]
+        windows = self._windows(room, number)
+        density = {"corridor": 0.15, "hall": 0.7, "bath": 0.6}.get(room.kind, 0.8)
+        pieces = furniture.STANDING[room.kind]
+        left = 0.7
+        while True:
+            piece, width, depth = pieces[rng.integers(len(pieces))]
+            width = min(width, length - 0.05 - left)
+            if width < 0.6:
+                return
+            blocked = [end for start, end in doors if start < left + width and end > left]
+            if blocked:
+                left = max(blocked) + 0.02
+                continue
+            daylight = any(a < left + width and b > left for a, b in windows)
+            frame = frame_at(x, y, angle)
+            frame[3] += left * frame[0] + 0.01 * frame[1]
+            stands = rng.random() < density and not (daylight and piece in furniture.TALL)
+            if stands:
+                self._place(piece, frame, width, depth)
+            if not daylight and not (stands and piece in furniture.TALL) and rng.random() < 0.6:
+                self._hang(frame, width)
+            left += width + float(rng.uniform(0.05, 0.5))
 
+    def _place(self, piece: furniture.Piece, frame: FloatArray, width: float, depth: float) -> None:
+        piece(self.soup, self.rng, frame, width)
+        corners = np.stack([frame[3], frame[3] + width * frame[0] + depth * frame[1]])
+        self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
 
-def _books(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """Rows of spines of all colours between boards; the upper part of a row is dark."""
-    width, height, row = parameters[:3]
-    shelf = np.floor(texels.v / row)
-    v = texels.v - shelf * row
-    cell = texels.u / 0.045 + 0.3 * cell_hash(shelf, shelf + texels.shift, 3)
-    spine = np.floor(cell + 0.35 * cell_hash(cell, shelf + texels.shift, 5))
-    luck = [cell_hash(spine + texels.shift, shelf + texels.shift_v, salt) for salt in (11, 12, 13)]
-    tall = (
-        row * (0.55 + 0.33 * luck[0]) * (cell_hash((spine / 7.0 + texels.shift).astype(np.float32), shelf, 14) > 0.15)
-    )
-    near = np.clip(0.045 / texels.u_size - 0.4, 0.0, 1.0)
-    spines = 0.1 + 0.55 * (0.5 * np.stack(luck) + 0.5 * luck[0]).astype(np.float32) * (0.5 + 0.5 * luck[1])
-    title = band(v, texels.v_size, 0.6 * tall, 0.75 * tall) * (luck[2] > 0.5)
-    rgb = mix(np.float32(0.42), mix(spines, 1.0 - 0.6 * spines, 0.8 * title), near)
-    rgb = mix(0.25 * colours[0], rgb, band(v, texels.v_size, 0.0, tall))
-    boards = np.maximum(stripes(texels.v + 0.012, texels.v_size, row, 0.024), _rim(texels, width, height, 0.025))
-    return mix(rgb, colours[0] * (1.0 + fractal(texels, (0.4, 0.05, 0.1))), boards)
+    def _hang(self, frame: FloatArray, width: float) -> None:
+        """A picture, a poster, a mirror or a screen at the height of the eyes."""
+        rng = self.rng
+        across, high = float(rng.uniform(0.4, min(width, 1.2))), float(rng.uniform(0.4, 0.8))
+        first, second = colour(rng, *furniture.PAINTS), colour(rng, *furniture.CLOTHS)
+        kind = rng.random()
+        if kind < 0.75:
+            look = self.soup.instance(Material.PICTURE, first, second, (across, high, float(rng.integers(3))))
+        elif kind < 0.9:
+            look = self.soup.instance(Material.SCREEN, first, second, (across, high))
+        else:
+            look = self.soup.instance(Material.PANE, np.array([0.72, 0.76, 0.78]), self.skirting, (across, high, 0.0))
+        low = (float(rng.uniform(0.0, width - across)), 0.0, 1.6 - 0.5 * high + float(rng.uniform(-0.1, 0.15)))
+        furniture.plate(self.soup, frame, low, (across, 0.02, high), look, self.frame_look)
 
+    def _windows(self, room: Room, number: int) -> list[tuple[float, float]]:
+        """Panes in an outside wall, which light the room; where they begin and end along it."""
+        if number not in room.outside:
+            return []
+        rng = self.rng
+        (x, y), angle, length = room.side(number)
+        low, high = (1.6, 1.6) if room.kind == "hall" else (0.95, 1.2)
+        width = min(float(rng.uniform(1.0, 1.7)), length - 0.4)
+        spans, left = [], float(rng.uniform(0.2, 0.9))
+        while left + width < length - 0.1:
+            frame = frame_at(x, y, angle)
+            sky = np.array([0.86, 0.92, 0.98]) * float(rng.uniform(0.9, 1.05))
+            pane = self.soup.instance(Material.PANE, sky, self.skirting, (width, high, 1.0))
+            furniture.plate(self.soup, frame, (left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
+            middle = frame[3] + (left + 0.5 * width) * frame[0] + 0.8 * frame[1]
+            self.lights.append(
+                (middle[0], middle[1], low + 0.6 * high, (0.35 if room.kind == "hall" else 0.7) * width * high)
+            )
+            spans.append((left, left + width))
+            left += width + float(rng.uniform(0.5, 2.5))
+        return spans
 
-def _picture(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """A painting of blots, or a poster of a picture and text, in a frame."""
-    width, height, kind = parameters[:3]
-    scale = np.float32(1.0)
-    blot = fractal(texels, (0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.4)) * scale
-    first, second = np.clip(9.0 * blot + 0.5, 0.0, 1.0), np.clip(9.0 * np.abs(blot - 0.3) - 1.2, 0.0, 1.0)
-    third = np.stack([colours[1][2], colours[0][0], colours[1][0]])
-    rgb = mix(mix(third, colours[0], second), colours[1], first)
-    line = 0.03 + 0.02 * (kind - 1.0)
-    paper = np.asarray(mix(np.float32(0.9), _INK, _text(texels, line, 0.035)))
-    written = band(texels.v, texels.v_size, 0.0, 0.38 * height) * (kind > 0)
-    rgb = mix(rgb, paper, written)
-    return mix(rgb, np.where(kind > 0, 0.92, 0.25 * colours[0]), _rim(texels, width, height, 0.03))
+    def _fill_middle(self, room: Room) -> None:
+        """A table or a carpet; rows of racks in the hall."""
+        rng, (x0, y0, x1, y1) = self.rng, room.area
+        low = np.array([x0, y0]) + _DEEPEST + _AISLE
+        free = np.array([x1, y1]) - _DEEPEST - _AISLE - low
+        if room.kind == "hall":
+            for y in np.arange(low[1], low[1] + free[1] - 0.5, 0.6 + 1.5):
+                left = low[0]
+                while left < x1 - _DEEPEST - _AISLE - 1.0:
+                    piece, width, depth = furniture.STANDING["hall"][rng.integers(3)]
+                    width = min(width, x1 - _DEEPEST - _AISLE - left)
+                    self._place(piece, frame_at(left, float(y), 0.0), width, depth)
+                    left += width + float(rng.choice([0.05, 1.3], p=[0.6, 0.4]))
+            return
+        if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
+            size = np.minimum(free + 1.0, 2.6)
+            tone, other = colour(rng, *furniture.CLOTHS), colour(rng, *furniture.PAINTS)
+            carpet = self.soup.instance(Material.CARPET, tone, other, (size[0], size[1], float(rng.uniform(0.2, 0.5))))
+            corner = np.array([*(low + 0.5 * (free - size)), 0.01])
+            self.soup.quad(corner, np.array([size[0], 0, 0]), np.array([0, size[1], 0]), carpet)
+        if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
+            width, depth = min(free[0], 1.8), min(free[1] - 0.6, 0.9)
+            x, y = low + 0.5 * (free - np.array([width, depth]))
+            furniture.dining(self.soup, rng, frame_at(float(x), float(y), 0.0), width, depth)
+            self.obstacles.append((float(x), float(y) - 0.3, float(x) + width, float(y) + depth + 0.3))
 
-
-def _screen(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """Windows of text on a desktop."""
-    width, height = parameters[:2]
-    pane = (texels.u % (0.5 * width) > 0.03 * width) & (texels.v % (0.7 * height) > 0.06 * height)
-    rgb = mix(colours[1], mix(np.float32(0.85), _INK, _text(texels, 0.018, 0.02)), pane)
-    return mix(rgb, 0.3 * _INK, _rim(texels, width, height, 0.015))
-
-
-def _pane(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """A bright window or a mirror, with a frame and a cross of bars."""
-    width, height, bars = parameters[:3]
-    bar = band(texels.u, texels.u_size, 0.5 * width - 0.02, 0.5 * width + 0.02)
-    bar = np.maximum(bar, band(texels.v, texels.v_size, 0.65 * height - 0.02, 0.65 * height + 0.02)) * bars
-    sheen = 1.0 + 0.1 * (texels.v / height - 0.5) + fractal(texels, (0.9, 0.7, 0.05))
-    return mix(colours[0] * sheen, colours[1], np.maximum(bar, _rim(texels, width, height, 0.045)))
-
-
-def _carton(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    width, height = parameters[:2]
-    grain = fractal(texels, (0.6, 0.5, 0.07), (0.1, 0.1, 0.05), (0.015, 0.2, 0.04))
-    tape = band(texels.v, texels.v_size, 0.47 * height, 0.47 * height + 0.05)
-    rgb = mix(colours[0] * (1.0 + grain), 1.25 * colours[0], 0.7 * tape)
-    label = band(texels.u, texels.u_size, 0.1 * width, 0.45 * width)
-    label = label * band(texels.v, texels.v_size, 0.08 * height, 0.38 * height) * (colours[1][0] > 0.3)
-    rgb = mix(rgb, mix(np.float32(0.88), colours[1] * 0.3, _text(texels, 0.035, 0.03)), label)
-    return rgb * (1.0 - 0.35 * _rim(texels, width, height, 0.008))
-
-
-def _lamp(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    return np.asarray(colours[0], dtype=np.float32)
-
-
-SHADERS = {
-    Material.PLASTER: _plaster,
-    Material.TILES: _tiles,
-    Material.BOARDS: _boards,
-    Material.CARPET: _carpet,
-    Material.WOOD: _wood,
-    Material.FABRIC: _fabric,
-    Material.BOOKS: _books,
-    Material.PICTURE: _picture,
-    Material.SCREEN: _screen,
-    Material.PANE: _pane,
-    Material.CARTON: _carton,
-    Material.LAMP: _lamp,
-}
+    def _lamps(self, room: Room) -> None:
+        """Flat lamps below the ceiling, about 3 m apart."""
+        rng, (x0, y0, x1, y1) = self.rng, room.area
+        bulb = self.soup.instance(Material.LAMP, np.array([1.0, 0.98, 0.92]))
+        strength = (0.8 if room.kind == "hall" else 1.0) * float(rng.uniform(0.8, 1.2))
+        across, along = (max(1, round((extent) / 3.4)) for extent in (x1 - x0, y1 - y0))
+        for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
+            for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
+                size = (0.5, 0.3, 0.05)
+                furniture.solid(
+                    self.soup, frame_at(x - 0.25, y - 0.15, 0.0, room.height - 0.06), (0, 0, 0.001), size, bulb
+                )
+                self.lights.append((float(x), float(y), room.height - 0.3, strength))

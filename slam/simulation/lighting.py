@@ -4,7 +4,7 @@ import numpy as np
 
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, IntArray
-from slam.simulation.interior import GLOWING
+from slam.simulation.room_texture import GLOWING
 from slam.simulation.surface import Surface
 
 _RAYS = 48  # around a corner

@@ -11,8 +11,7 @@ from slam.simulation.floor import Floor
 from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, Soup
 from slam.simulation.hazards import SHUTTER
 from slam.simulation.house import House, draw_house
-from slam.simulation.interior import GLOWING
-from slam.simulation.interiors import Interior, furnish
+from slam.simulation.interior import Interior, furnish
 from slam.simulation.lighting import illuminate
 from slam.simulation.motion import Carried, carry
 from slam.simulation.moving import Moving
@@ -20,6 +19,7 @@ from slam.simulation.objects import person
 from slam.simulation.optics import square_intrinsics
 from slam.simulation.options import SimulationOptions
 from slam.simulation.painter import Hits, unlit
+from slam.simulation.room_texture import GLOWING
 from slam.simulation.surface import Surface, place_rays
 from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
 

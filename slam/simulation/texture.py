@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.simulation import interior
+from slam.simulation import room_texture
 from slam.simulation.geometry import Float32Array, Material
 from slam.simulation.noise import Texels, band, cell_hash, fractal, mix, stripes
 
@@ -199,5 +199,5 @@ _SHADERS: dict[Material, Shader] = {
     Material.GLASS: _glass,
     Material.TYRE: _tyre,
     Material.FENCE: _fence,
-    **interior.SHADERS,
+    **room_texture.SHADERS,
 }

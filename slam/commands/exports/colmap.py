@@ -75,7 +75,8 @@ def _tracked(places: Places, options: ExportOptions) -> tuple[FloatArray, Sighti
     """Points of corners ``(P, 3)`` in the axes of the run, at most as many as wanted, the longest tracks first."""
     if not places.views:
         return np.zeros((0, 3)), Sightings.none()
-    tracks = PlaceStructure(places, OF_KEYFRAMES).tracks()
+    structure = PlaceStructure(places, OF_KEYFRAMES)
+    tracks = structure.tracks()
     length = np.bincount(tracks.point, minlength=len(tracks.points))
     wanted = np.isfinite(tracks.points).all(axis=1)
     if options.crop is not None:
@@ -85,7 +86,6 @@ def _tracked(places: Places, options: ExportOptions) -> tuple[FloatArray, Sighti
     number[chosen] = np.arange(len(chosen))
     kept = number[tracks.point] >= 0
     views, corners = tracks.views[kept], tracks.corners[kept]
-    first = np.cumsum([0, *map(len, places.views)])
-    pixels = np.concatenate([view.pixels for view in places.views])[first[views] + corners].astype(np.float64)
+    pixels = structure.pixels(views, corners)
     frames = np.array([view.index for view in places.views], np.intp)[views]
     return tracks.points[chosen], Sightings(frames, pixels, number[tracks.point[kept]], tracks.errors_px[kept])

@@ -9,8 +9,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import Terminated
@@ -18,9 +16,8 @@ from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config.sections import SlamConfig, dump_yaml
 from slam.evaluation.double_walls import double_wall_share
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame, Intrinsics
+from slam.frames import Frame
 from slam.frames import Sequence as FrameSequence
-from slam.loops.places import Places
 from slam.mapping.submap import remove_submaps
 from slam.mapping.surface import positions
 from slam.pipeline.batch import SlamPipeline
@@ -158,13 +155,7 @@ def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
         folder.write_trajectory("lidar", lidar)
     result.graph.write_g2o(folder.path / GRAPH)
     folder.write_text(LOOPS, json.dumps(result.loops.details(), indent=2, allow_nan=False))
-    folder.write(PLACES, _places(result, job.recording.intrinsics).write)
-
-
-def _places(result: Estimate, intrinsics: Intrinsics) -> Places:
-    """The camera, and every view with its points at the poses of the optimised trajectory."""
-    T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in result.views], dtype=np.intp)]
-    return Places(intrinsics, tuple(result.views), T_world_camera)
+    folder.write(PLACES, result.places(job.recording.intrinsics).write)
 
 
 def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:

@@ -15,7 +15,7 @@ from slam.frontend.keyframes.descriptors import Descriptors
 from slam.frontend.keyframes.flow import flow
 from slam.frontend.sparse_flow import Pixels
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.geometry.triangulation import triangulate
+from slam.geometry.triangulation import reprojection_errors, triangulate
 
 TrackIds = NDArray[np.int64]
 
@@ -119,10 +119,7 @@ class LocalMap:
             point.append(b)
         T, ray, row = np.concatenate(poses), np.concatenate(rays), np.concatenate(point)
         X, angle = triangulate(T, ray, row, len(track_ids))
-        Y = np.einsum("sij,sj->si", T[:, :3, :3], X[row]) + T[:, :3, 3]
-        in_front = Y[:, 2] > 0
-        offset = (Y[:, :2] / np.where(in_front, Y[:, 2], 1.0)[:, None] - ray[:, :2]) * [intrinsics.fx, intrinsics.fy]
-        error = np.where(in_front, np.linalg.norm(offset, axis=1), np.inf)
+        error = reprojection_errors(T, X[row], ray, (intrinsics.fx, intrinsics.fy))
         worst = np.zeros(len(track_ids))
         np.maximum.at(worst, row, error)
         good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX)

@@ -92,7 +92,7 @@ def find_scale(
     Without a road in most frames, the planes that were found give no unit that means anything.
     """
     motions, frames = drive.steps.triangulated, len(drive)
-    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
+    metres = _lengths(lidar_steps)
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
         height = height_by_lidar(lidar_steps, drive) or camera_height_m
@@ -142,9 +142,13 @@ def _measured_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, 
     return {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
 
 
+def _lengths(steps: Sequence[RelativePose]) -> dict[Ends, float]:
+    return {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in steps}
+
+
 def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
     """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
-    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
+    metres = _lengths(lidar_steps)
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:

@@ -50,7 +50,7 @@ class PredictedFlow:
 
     def depth_current(self) -> DepthMap:
         """Z-depth ``(H, W)`` of the later image, of the surfaces that the earlier one shows; NaN where unknown."""
-        grid = _pixels(*self.depth_previous.shape)
+        grid = _pixels(self.intrinsics)
         flow = self._current - grid
         before = grid - flow
         for _ in range(_INVERSIONS - 1):  # fixed point: a pixel less the flow that ends there
@@ -85,10 +85,10 @@ class PredictedFlow:
         )
         ahead = cv2.max(z, _NEAREST)
         flow = cv2.merge([cv2.divide(x, ahead) - u, cv2.divide(y, ahead) - v[:, None]])
-        return np.asarray(cv2.resize(flow, (width, height)) + _pixels(height, width))
+        return np.asarray(cv2.resize(flow, (width, height)) + _pixels(self.intrinsics))
 
 
 @lru_cache(maxsize=2)
-def _pixels(height: int, width: int) -> NDArray[np.float32]:
+def _pixels(intrinsics: Intrinsics) -> NDArray[np.float32]:
     """Each pixel's own column and row ``(H, W, 2)``."""
-    return np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in (width, height))), axis=-1)
+    return intrinsics.pixel_grid().astype(np.float32)

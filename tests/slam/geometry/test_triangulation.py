@@ -1,7 +1,7 @@
 import numpy as np
 
 from slam.geometry.se3 import apply, from_rotation_vector, invert
-from slam.geometry.triangulation import triangulate
+from slam.geometry.triangulation import reprojection_errors, triangulate
 
 
 def test_points_and_angles_of_exact_rays() -> None:
@@ -22,3 +22,10 @@ def test_parallel_rays_give_no_point() -> None:
     found, angle = triangulate(T, np.array([[0.1, 0.0, 1.0]] * 2), np.zeros(2, np.int64), 1)
     assert np.isnan(found).all()
     assert angle[0] < 1e-6
+
+
+def test_reprojection_errors_by_hand() -> None:
+    points = np.array([[0.0, 0.0, 2.0], [1.0, 0.5, 2.0], [0.0, 0.0, -1.0]])
+    rays = np.array([[0.0, 0.0, 1.0], [0.47, 0.29, 1.0], [0.0, 0.0, 1.0]])
+    errors = reprojection_errors(np.tile(np.eye(4), (3, 1, 1)), points, rays, (100.0, 100.0))
+    np.testing.assert_allclose(errors, [0.0, 5.0, np.inf])

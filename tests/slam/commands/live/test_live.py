@@ -75,11 +75,18 @@ def fill(source: Path, target: Path, messages: list[dict[str, Any]], vanishes: b
     Thread(target=run, daemon=True).start()
 
 
-def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
-    target, messages = tmp_path / "images", []
+def filled(street: Path, tmp_path: Path) -> tuple[Path, list[dict[str, Any]]]:
+    """A folder beside its camera file that `fill` fills, and the messages that it waits for."""
+    target: Path = tmp_path / "images"
+    messages: list[dict[str, Any]] = []
     target.mkdir()
     shutil.copy(street / "camera.yaml", tmp_path)
     fill(street / "images", target, messages)
+    return target, messages
+
+
+def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    target, messages = filled(street, tmp_path)
     request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     offline = run_slam(street, weights=tiny_weights, overrides=SETTINGS, output=tmp_path / "run")
@@ -102,10 +109,7 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
 def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None
 ) -> None:
-    target, messages = tmp_path / "images", []
-    target.mkdir()
-    shutil.copy(street / "camera.yaml", tmp_path)
-    fill(street / "images", target, messages)
+    target, messages = filled(street, tmp_path)
     at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
     settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
     request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=600)
@@ -462,10 +466,7 @@ def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path:
 def test_a_live_run_that_was_killed_is_finished_as_far_as_it_was_kept(
     street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target, messages = tmp_path / "images", []
-    target.mkdir()
-    shutil.copy(street / "camera.yaml", tmp_path)
-    fill(street / "images", target, messages)
+    target, messages = filled(street, tmp_path)
     monkeypatch.setattr(batch, "EVERY_FRAMES", 4)
 
     def listen(message: dict[str, Any]) -> None:

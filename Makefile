@@ -1,4 +1,4 @@
-# A fresh machine needs Python 3.11 and make, nothing else. `make demo` and `make test` set everything up.
+# A fresh machine needs Python 3.11 to 3.13 and make, nothing else. `make demo` and `make test` set everything up.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,7 +14,7 @@ UV ?= uv
 # Tests are of one thread each; a file's tests stay together, for they share what they prepare
 PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-.PHONY: setup lock demo test test-all lint benchmark clean
+.PHONY: setup lock demo test test-all lint benchmark dist publish clean
 
 setup: $(READY)
 
@@ -50,6 +50,15 @@ lint: setup
 
 benchmark: setup
 	$(BIN)/python -m pytest -q -s tests/benchmarks
+
+dist: setup
+	rm -rf dist
+	$(BIN)/python -m hatchling build
+	$(BIN)/python -m twine check --strict dist/*
+
+# By a workflow that the package index trusts; elsewhere twine asks for a token
+publish: dist
+	$(BIN)/python -m twine upload dist/*
 
 clean:
 	rm -rf $(VENV) results runs dist build

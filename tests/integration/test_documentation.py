@@ -377,6 +377,19 @@ def test_what_is_not_run_exists() -> None:
             assert extra and extra[1] in project["optional-dependencies"], f"{block}: no extra {arguments[1]}"
 
 
+def test_extras_pythons_and_workflows_are_those_of_the_project() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
+    table = readme.partition("| extra |")[2].partition("\n\n")[0]
+    assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == set(project["optional-dependencies"])
+    workflows = {path.stem: yaml.safe_load(path.read_text()) for path in (ROOT / ".github/workflows").glob("*.yml")}
+    pythons = workflows["test"]["jobs"]["test"]["strategy"]["matrix"]["python"]
+    assert pythons == [each for row in project["classifiers"] for each in re.findall(r"Python :: (3\.\d+)", row)]
+    steps = [step for flow in workflows.values() for job in flow["jobs"].values() for step in job["steps"]]
+    targets = re.findall(r"^make (\w+)", "\n".join(step.get("run", "") for step in steps), re.MULTILINE)
+    assert {"test", "publish"} <= set(targets) <= set(re.findall(r"^(\w+):", makefile, re.MULTILINE))
+
+
 def test_the_main_commands_are_found_in_the_documents() -> None:
     """A parser that finds no command would pass all tests above."""
     found = {" ".join(shlex.split(bare(block.text))[:2]) for block in commands()}

@@ -1,4 +1,4 @@
-"""The wheel, built and installed into an environment of its own, runs from an empty folder and without a network."""
+"""The sdist and the wheel made from it; installed into an environment of its own, it runs from an empty folder offline."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,8 +45,9 @@ def call(*command: object, folder: Path, **environment: str) -> str:
 
 @dataclass(frozen=True)
 class Installed:
-    """The wheel in an environment of its own."""
+    """The wheel of the sdist in an environment of its own."""
 
+    sdist: Path
     wheel: Path
     environment: Path
 
@@ -59,10 +61,11 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     """A new environment with the wheel; dependencies are read from this one, its own install of the packages is not."""
     folder = tmp_path_factory.mktemp("wheel")
     pip = (sys.executable, "-m", "pip")
-    path = os.environ.get("PYTHONPATH", "")
+    call(sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", folder, folder=ROOT)
+    (sdist,) = folder.glob("*.tar.gz")
     call(
-        *pip, "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "-w", folder, ROOT,
-        folder=folder, PYTHONPATH=path,
+        *pip, "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "-w", folder, sdist,
+        folder=folder, PYTHONPATH=os.environ.get("PYTHONPATH", ""),
     )  # fmt: skip
     (wheel,) = folder.glob("*.whl")
     environment = folder / "environment"
@@ -73,7 +76,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     # a path in a .pth file is added as it is: .pth files in it, as that of an editable install, are not read
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
     (packages / "sitecustomize.py").write_text(NO_NETWORK)
-    return Installed(wheel, environment)
+    return Installed(sdist, wheel, environment)
 
 
 def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
@@ -86,6 +89,15 @@ def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
         package, *rest = file.relative_to(ROOT / "configs").parts
         parts = ("erfsfm", "_configs", "splits", *rest) if package == "splits" else (package, "_configs", *rest)
         assert "/".join(parts) in names
+
+
+def test_an_index_takes_both(installed: Installed, tmp_path: Path) -> None:
+    path = os.environ.get("PYTHONPATH", "")
+    twine = (sys.executable, "-m", "twine", "check", "--strict")
+    call(*twine, installed.sdist, installed.wheel, folder=tmp_path, PYTHONPATH=path)
+    with tarfile.open(installed.sdist) as archive:
+        names = {Path(*Path(name).parts[1:]).as_posix() for name in archive.getnames()}
+    assert {"Makefile", "constraints.txt", "requirements.lock", "tests/conftest.py", "CONTRIBUTING.md"} <= names
 
 
 def test_the_programs_are_those_of_the_wheel(installed: Installed, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The sdist and the wheel made from it; installed into an environment of its own, it runs from an empty folder offline."""
+"""The sdist, and the wheel made from it, which runs in an environment of its own, in an empty folder and offline."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_pages_that_code_names_exist() -> None:
 def test_the_index_lists_every_page() -> None:
     docs = ROOT / "docs"
     listed = {(docs / target).resolve() for target, _ in LINK.findall((docs / "README.md").read_text(encoding="utf-8"))}
-    assert listed == set(docs.rglob("*.md")) - {docs / "README.md"}
+    assert listed == {*docs.rglob("*.md"), *docs.rglob("*.ipynb")} - {docs / "README.md"}
 
 
 def test_commands_that_are_named_exist(page: Path) -> None:

@@ -9,6 +9,7 @@ the workspace or a line to one of the two tables.
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import nbformat
 import numpy as np
 import onnx
 import pytest
@@ -409,6 +411,33 @@ def stand_ins(world: Path) -> dict[str, Any]:
         "image": images[0],
         "five_images": images[:5],
     }
+
+
+def cells_of_notebook() -> list[Any]:
+    """The cells of the one notebook; its code is compiled under the name of its file."""
+    path = ROOT / "docs" / "first-steps.ipynb"
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    nbformat.validate(notebook)
+    sources = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook["cells"])
+    return [compile(source, f"{path.name}, code cell {k}", "exec") for k, source in enumerate(sources, 1)]
+
+
+def test_the_notebook_is_whole() -> None:
+    assert len(cells_of_notebook()) == 9
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names: dict[str, Any] = {}
+    for cell in cells_of_notebook():
+        exec(cell, names)
+    assert names["errors"].ate_rmse_m < 0.8, "0.4 m were measured"
+    assert np.isfinite(names["sigmas"]).all() and names["depth_m"].min() > 0
+    written = {path.relative_to("first-steps").as_posix() for path in Path("first-steps").rglob("*")}
+    assert {"map.glb", "poses.tum", "model/points3D.txt", "model/images/000119.png", "run/report.html"} <= written
 
 
 def blocks(*languages: str) -> list[Any]:

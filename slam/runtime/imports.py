@@ -47,8 +47,11 @@ def import_open3d() -> ModuleType:
 
 
 def _without_windows() -> ModuleType:
-    """Open3D, whose windows are imported where they are first used: their Dash and IPython are half of its time."""
-    if "open3d" in sys.modules:
+    """Open3D, whose windows are imported where they are first used: their Dash and IPython are half of its time.
+
+    In a notebook it comes whole, for it then prepares windows there at once.
+    """
+    if "open3d" in sys.modules or "ipykernel" in sys.modules:
         return importlib.import_module("open3d")
     sys.modules[_WINDOWS] = ModuleType(_WINDOWS)
     try:

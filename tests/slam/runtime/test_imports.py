@@ -1,4 +1,4 @@
-"""Open3D without its windows, which are there where they are used."""
+"""Open3D without its windows, which are there where they are used, and whole in a notebook."""
 
 from __future__ import annotations
 
@@ -18,8 +18,27 @@ assert not hasattr(o3d, "nonesuch")
 assert o3d.visualization.draw_geometries and o3d.visualization is sys.modules["open3d.visualization"]
 """
 
+IN_NOTEBOOK = """
+import builtins, sys
+from slam.runtime.imports import import_open3d
+
+class ZMQInteractiveShell:  # which Open3D asks for
+    pass
+
+builtins.get_ipython, sys.modules["ipykernel"] = ZMQInteractiveShell, sys
+assert import_open3d().visualization.draw_plotly
+"""
+
+
+def runs(code: str) -> None:
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+
+
+def test_open3d_is_imported_in_a_notebook() -> None:
+    runs(IN_NOTEBOOK)
+
 
 @pytest.mark.parametrize("use", ["", "import open3d.visualization", "from open3d.visualization import rendering"])
 def test_the_windows_of_open3d_are_imported_at_their_first_use(use: str) -> None:
-    finished = subprocess.run([sys.executable, "-c", WINDOWS % use], capture_output=True, text=True, check=False)
-    assert finished.returncode == 0, finished.stderr
+    runs(WINDOWS % use)

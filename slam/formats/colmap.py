@@ -1,11 +1,12 @@
-"""A run as a COLMAP model in text form: cameras.txt, images.txt, points3D.txt.
+"""A run as a COLMAP model, in text form and, for readers that know no other, in binary form in ``sparse/0``.
 
 COLMAP writes ``T_camera_world``, quaternions wxyz, and puts (0.5, 0.5) at the centre of the top-left pixel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import struct
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -20,8 +21,15 @@ from slam.runtime.errors import RunError
 from slam.runtime.storage.files import write_atomically
 
 MODEL_FILES = ("cameras.txt", "images.txt", "points3D.txt")
+BINARY_FOLDER = "sparse"
+_PINHOLE = 1
 _HEADER = "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY"
 _HALF_PIXEL = 0.5
+
+View = tuple[int, list[float], FloatArray, NDArray[np.intp]]
+"""Frame, quaternion wxyz and translation of ``T_camera_world``, corners ``(S, 2)`` in COLMAP's pixels, their points."""
+Point = tuple[list[float], list[int], float, list[tuple[int, int]]]
+"""Position, colour, mean error in pixels, and the track: numbers of images, and of corners in them."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,7 @@ def write_colmap(
     sightings: Sightings,
     without_image: Collection[int] = (),
 ) -> None:
-    """Write the three files.
+    """Write the three files in both forms.
 
     Args:
         folder: made where missing; other files in it stay.
@@ -69,10 +77,13 @@ def write_colmap(
         RunError: a file cannot be written.
     """
     of_frames = {k: rows for k, rows in sightings.of_frames().items() if k not in without_image}
-    images = _images(T_world_camera, without_image, sightings, of_frames)
-    contents = _camera(intrinsics), images, _points(points_world, colours, sightings, of_frames)
-    for name, lines in zip(MODEL_FILES, contents, strict=True):
-        _write(folder / name, lines)
+    views = list(_views(T_world_camera, without_image, sightings, of_frames))
+    points = list(_points(points_world, colours, sightings, of_frames))
+    text = _camera_text(intrinsics), _views_text(views), _points_text(points)
+    binary = [_camera_binary(intrinsics)], _views_binary(views), _points_binary(points)
+    for name, lines, parts in zip(MODEL_FILES, text, binary, strict=True):
+        _write(folder / BINARY_FOLDER / "0" / Path(name).with_suffix(".bin"), parts)
+        _write(folder / name, (f"{line}\n".encode("ascii") for line in lines))
 
 
 def is_own_model(folder: Path) -> bool:
@@ -81,53 +92,85 @@ def is_own_model(folder: Path) -> bool:
     return path.is_file() and path.read_bytes().startswith(_HEADER.encode())
 
 
-def _write(path: Path, lines: Iterable[str]) -> None:
+def _write(path: Path, parts: Iterable[bytes]) -> None:
     def fill(partial: Path) -> None:
-        with partial.open("w", encoding="ascii") as file:
-            file.writelines(f"{line}\n" for line in lines)
+        with partial.open("wb") as file:
+            file.writelines(parts)
 
     write_atomically(path, fill, RunError)
 
 
-def _camera(camera: Intrinsics) -> list[str]:
+def _pinhole(camera: Intrinsics) -> list[float]:
     principal = [camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
-    numbers = " ".join(map(repr, [float(value) for value in (camera.fx, camera.fy, *principal)]))
-    return [_HEADER, f"1 PINHOLE {camera.width} {camera.height} {numbers}"]
+    return [float(value) for value in (camera.fx, camera.fy, *principal)]
 
 
-def _images(
+def _views(
     T_world_camera: FloatArray,
     without_image: Collection[int],
     sightings: Sightings,
-    of_frames: Mapping[int, NDArray[np.intp]],
-) -> list[str]:
+    of_frames: dict[int, NDArray[np.intp]],
+) -> Iterator[View]:
     T_camera_world = invert(T_world_camera)
     quaternions_xyzw = Rotation.from_matrix(T_camera_world[:, :3, :3]).as_quat(canonical=True)
     rows = np.concatenate([quaternions_xyzw[:, [3, 0, 1, 2]], T_camera_world[:, :3, 3]], axis=1)
-    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of X Y POINT3D_ID"]
-    for k, row in enumerate(rows):
+    for k, row in enumerate(rows.tolist()):
         if k not in without_image:
             seen = of_frames.get(k, np.zeros(0, np.intp))
-            pixels = zip((sightings.pixels[seen] + _HALF_PIXEL).tolist(), sightings.point[seen].tolist())
-            corners = " ".join(f"{x:.7g} {y:.7g} {point + 1}" for (x, y), point in pixels)
-            lines += [f"{k + 1} {' '.join(map(repr, row.tolist()))} 1 {k:06d}.png", corners]
-    return lines
+            yield k, row, sightings.pixels[seen] + _HALF_PIXEL, sightings.point[seen]
 
 
 def _points(
     points_world: FloatArray,
     colours: NDArray[np.uint8],
     sightings: Sightings,
-    of_frames: Mapping[int, NDArray[np.intp]],
-) -> Iterator[str]:
-    yield "# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)"
-    tracks: dict[int, list[str]] = {}
+    of_frames: dict[int, NDArray[np.intp]],
+) -> Iterator[Point]:
+    tracks: dict[int, list[tuple[int, int]]] = {}
     for frame, rows in of_frames.items():
         for corner, point in enumerate(sightings.point[rows].tolist()):
-            tracks.setdefault(point, []).append(f"{frame + 1} {corner}")
+            tracks.setdefault(point, []).append((frame + 1, corner))
     count = len(points_world)
     total = np.bincount(sightings.point, sightings.errors_px, count)
     errors = total / np.maximum(np.bincount(sightings.point, minlength=count), 1)
-    for k, (point, colour, error) in enumerate(zip(points_world, colours, errors, strict=True)):
-        place, shade = " ".join(f"{x:.9g}" for x in point.tolist()), " ".join(map(str, colour.tolist()))
-        yield " ".join((f"{k + 1} {place} {shade} {error:.4g}", *tracks.get(k, ())))
+    columns = points_world.tolist(), colours.tolist(), errors.tolist()
+    for k, (place, colour, error) in enumerate(zip(*columns, strict=True)):
+        yield place, colour, error, tracks.get(k, [])
+
+
+def _camera_text(camera: Intrinsics) -> list[str]:
+    return [_HEADER, f"1 PINHOLE {camera.width} {camera.height} {' '.join(map(repr, _pinhole(camera)))}"]
+
+
+def _views_text(views: list[View]) -> Iterator[str]:
+    yield "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of X Y POINT3D_ID"
+    for k, pose, pixels, points in views:
+        yield f"{k + 1} {' '.join(map(repr, pose))} 1 {k:06d}.png"
+        corners = zip(pixels.tolist(), points.tolist())
+        yield " ".join(f"{x:.7g} {y:.7g} {point + 1}" for (x, y), point in corners)
+
+
+def _points_text(points: list[Point]) -> Iterator[str]:
+    yield "# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)"
+    for k, (place, colour, error, track) in enumerate(points):
+        numbers = " ".join(f"{x:.9g}" for x in place), " ".join(map(str, colour)), f"{error:.4g}"
+        yield " ".join((f"{k + 1}", *numbers, *(f"{image} {corner}" for image, corner in track)))
+
+
+def _camera_binary(camera: Intrinsics) -> bytes:
+    return struct.pack("<QIiQQ4d", 1, 1, _PINHOLE, camera.width, camera.height, *_pinhole(camera))
+
+
+def _views_binary(views: list[View]) -> Iterator[bytes]:
+    yield struct.pack("<Q", len(views))
+    for k, pose, pixels, points in views:
+        yield struct.pack("<I7dI", k + 1, *pose, 1) + f"{k:06d}.png\0".encode("ascii")
+        corners = np.empty(len(points), [("pixel", "<f8", 2), ("point", "<u8")])
+        corners["pixel"], corners["point"] = pixels, points + 1
+        yield struct.pack("<Q", len(corners)) + corners.tobytes()
+
+
+def _points_binary(points: list[Point]) -> Iterator[bytes]:
+    yield struct.pack("<Q", len(points))
+    for k, (place, colour, error, track) in enumerate(points):
+        yield struct.pack("<Q3d3BdQ", k + 1, *place, *colour, error, len(track)) + np.array(track, "<u4").tobytes()

@@ -35,7 +35,7 @@ def write_model(
     options: ExportOptions,
     progress: Progress,
 ) -> None:
-    """Write ``images/`` and, last, the model in text form.
+    """Write ``images/`` and, last, the model.
 
     Args:
         folder: the run; one that does not record where its images are has none here, with a warning.

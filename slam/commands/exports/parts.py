@@ -10,7 +10,7 @@ from pathlib import Path
 from slam.commands.exports.nerfstudio import POINTS
 from slam.commands.exports.options import R_UP_WORLDS, ExportOptions
 from slam.commands.exports.raster import RASTER_FILES, is_own_raster
-from slam.formats.colmap import MODEL_FILES, is_own_model
+from slam.formats.colmap import BINARY_FOLDER, MODEL_FILES, is_own_model
 from slam.formats.ros_map import describes_map
 from slam.formats.transforms import TRANSFORMS, is_own_scene
 from slam.results.folder import RunFolder
@@ -55,7 +55,7 @@ PARTS = {
     "graph": Part((), {".g2o": b"VERTEX_SE3", ".txt": b"VERTEX_SE3"}, up="y-down"),
     "colmap": Part(
         ("crop", "voxel", "dataset", "points"),
-        folder=FolderPart("a COLMAP model", ("images", *MODEL_FILES), is_own_model),
+        folder=FolderPart("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), is_own_model),
     ),
     "nerfstudio": Part(
         ("crop", "voxel", "dataset"), folder=FolderPart("a scene", ("images", POINTS, TRANSFORMS), is_own_scene)

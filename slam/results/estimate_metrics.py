@@ -17,7 +17,7 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence, runs
-from slam.frontend.agreement import confidence, confidence_of_frames
+from slam.frontend.agreement import confidence_of_frames
 from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
@@ -65,7 +65,7 @@ def estimate_metrics(
         scale=_scale(result),
         agreement=[AgreementMetrics(**asdict(each)) for each in result.agreements],
         confidence=ConfidenceMetrics(
-            run=confidence(result.agreements), frames=confidence_of_frames(result.support).round(2).tolist()
+            run=result.confidence, frames=confidence_of_frames(result.support).round(2).tolist()
         ),
         trajectories=Trajectories(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),

@@ -116,15 +116,16 @@ def of_images(drive: Drive, focal_length: FocalLength, support: FloatArray, need
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
     steps, on_road, mean = len(drive.steps.triangulated), len(drive.road_steps), float(support.mean())
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
-    found = [
-        ("the overlap of images", _support_sigmas(mean), f"{100 * mean:.0f} % of the corners fit in the next image"),
-        ("gaps", gaps, f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"),
-    ]
+    figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
+    found = [("gaps", gaps, figure)]
+    if drive.motions or drive.failures or drive.map_poses.segments:  # else nothing was asked of the corners
+        figure = f"{100 * mean:.0f} % of the corners fit in the next image"
+        found.append(("the overlap of images", float(_support_sigmas(mean)), figure))
     if needs_road and steps >= _LEAST:
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         found.append(("the view of the road", sigmas, figure))
-    agreements = [Agreement(source, float(sigmas), figure, "good drives") for source, sigmas, figure in found]
+    agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]
     if focal_length.error is not None:
         logarithm, sigma = focal_length.error
         figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"

@@ -23,6 +23,7 @@ from slam.commands.live.cli import verbs as live_verbs
 from slam.commands.localisation.cli import verbs as localisation_verbs
 from slam.commands.options import Json, Seed, UnusedDevice, options_of
 from slam.commands.run.request import RunRequest
+from slam.runtime.errors import SlamError
 from slam.runtime.terminal import print_table
 
 if TYPE_CHECKING:
@@ -149,8 +150,9 @@ def doctor(
     lines = examine(dataset, camera)
     for line in lines:
         typer.echo(line)
-    if any(line.startswith("missing") for line in lines if line != NO_DATA_SET):
-        raise typer.Exit(1)
+    missing = sum(line.startswith("missing") for line in lines if line != NO_DATA_SET)
+    if missing:
+        raise SlamError(f"{missing} of {len(lines)} parts are missing: do what their lines say")
 
 
 def _print_run(path: Path, metrics: Metrics) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.odometry import OdometryState
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 
@@ -30,8 +30,9 @@ _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
 _FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens bias it
 # of good drives (docs/reliability.md): mean and spread
-_SUPPORT, _SUPPORT_SPREAD = 0.65, 0.12
+_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
+_FAR_SPREAD, _FAR_CORNERS = 0.15, 0.05  # of the logarithm; and least corners over the most of a distance
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
 _SIGMAS, _CONFIDENCE = (1.0, 2.0, 3.0, 5.0), (0.97, 0.8, 0.4, 0.1)
@@ -104,12 +105,12 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
     return Agreement(source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %")
 
 
-def of_images(drive: Drive, focal_length: FocalLength, support: FloatArray, needs_road: bool) -> list[Agreement]:
+def of_images(drive: Drive, odometry: OdometryState, support: FloatArray, needs_road: bool) -> list[Agreement]:
     """How far the images of a completed drive are from those of good drives, in the log too.
 
     Args:
         drive: all its measurements.
-        focal_length: what corners say of it.
+        odometry: what its corners say of the camera and of learned depth.
         support: of the frames ``(N,)``, by `frame_support`.
         needs_road: whether lengths are measured on the road.
     """
@@ -125,9 +126,13 @@ def of_images(drive: Drive, focal_length: FocalLength, support: FloatArray, need
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         found.append(("the view of the road", sigmas, figure))
+    too_far = odometry.depth_error.most_too_far(_FAR_CORNERS)
+    if needs_road and not drive.maps and too_far is not None:
+        figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
+        found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
     agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]
-    if focal_length.error is not None:
-        logarithm, sigma = focal_length.error
+    if odometry.focal_length.error is not None:
+        logarithm, sigma = odometry.focal_length.error
         figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"
         sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
         agreements.append(Agreement("the focal length", sigmas, figure))

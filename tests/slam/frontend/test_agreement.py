@@ -14,8 +14,12 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
 from slam.frontend.segments import Segment
 from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.odometry import OdometryState
+from slam.frontend.visual.tracking import CornerTrackerState
 from slam.geometry import se3
 
 FRAMES = 40
@@ -75,9 +79,10 @@ def driven(support: float = 0.7, on_road: int = FRAMES, segments: int = 1, focal
         roads=[MeasurementFailure("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
     )
-    shown = FocalLength(1e6, -1e6 * focal)
+    tracker, mask = CornerTrackerState({}), DynamicMask.empty(416, 128, 1.0)
+    camera = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
     by_frame = agreement.frame_support(len(drive), drive.motions, ())
-    return agreement.confidence(agreement.of_images(drive, shown, by_frame, needs_road=True))
+    return agreement.confidence(agreement.of_images(drive, camera, by_frame, needs_road=True))
 
 
 @pytest.mark.parametrize(

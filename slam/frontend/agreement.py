@@ -33,6 +33,7 @@ _FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens 
 _SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _FAR_SPREAD, _FAR_CORNERS = 0.15, 0.05  # of the logarithm; and least corners over the most of a distance
+_CONTRADICTED_SPREAD = 0.007
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
 _SIGMAS, _CONFIDENCE = (1.0, 2.0, 3.0, 5.0), (0.97, 0.8, 0.4, 0.1)
@@ -105,13 +106,16 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
     return Agreement(source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %")
 
 
-def of_images(drive: Drive, odometry: OdometryState, support: FloatArray, needs_road: bool) -> list[Agreement]:
+def of_images(
+    drive: Drive, odometry: OdometryState, support: FloatArray, contradicted: int, needs_road: bool
+) -> list[Agreement]:
     """How far the images of a completed drive are from those of good drives, in the log too.
 
     Args:
         drive: all its measurements.
         odometry: what its corners say of the camera and of learned depth.
         support: of the frames ``(N,)``, by `frame_support`.
+        contradicted: number of steps whose length learned depth or the speed before contradicts.
         needs_road: whether lengths are measured on the road.
     """
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
@@ -119,6 +123,9 @@ def of_images(drive: Drive, odometry: OdometryState, support: FloatArray, needs_
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
     found = [("gaps", gaps, figure)]
+    if steps:
+        figure = f"learned depth or the speed before contradict {contradicted} of {steps}"
+        found.append(("lengths of steps", contradicted / steps / _CONTRADICTED_SPREAD, figure))
     if drive.motions or drive.failures or drive.map_poses.segments:  # else nothing was asked of the corners
         figure = f"{100 * mean:.0f} % of the corners fit in the next image"
         found.append(("the overlap of images", float(_support_sigmas(mean)), figure))

@@ -151,7 +151,7 @@ class SlamPipeline:
         scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
         support = agreement.frame_support(len(drive), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
-        of_images = agreement.of_images(drive, state.odometry, support, needs_road)
+        of_images = agreement.of_images(drive, state.odometry, support, len(scale.contradicted), needs_road)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         if closure is None:
             with self._watch.stage("loops"):

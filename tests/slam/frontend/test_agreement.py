@@ -70,7 +70,9 @@ def test_disparity_that_is_read_as_depth_is_doubtful() -> None:
     assert sigmas[0] < 1 and sigmas[1] > agreement.DOUBTFUL
 
 
-def driven(support: float = 0.7, on_road: int = FRAMES, segments: int = 1, focal: float = 0.0) -> float:
+def driven(
+    support: float = 0.7, on_road: int = FRAMES, segments: int = 1, contradicted: int = 0, focal: float = 0.0
+) -> float:
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
     drive = Drive(
@@ -82,11 +84,13 @@ def driven(support: float = 0.7, on_road: int = FRAMES, segments: int = 1, focal
     tracker, mask = CornerTrackerState({}), DynamicMask.empty(416, 128, 1.0)
     camera = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
     by_frame = agreement.frame_support(len(drive), drive.motions, ())
-    return agreement.confidence(agreement.of_images(drive, camera, by_frame, needs_road=True))
+    return agreement.confidence(agreement.of_images(drive, camera, by_frame, contradicted, needs_road=True))
 
 
 @pytest.mark.parametrize(
-    "doubtful", [{"support": 0.2}, {"on_road": 10}, {"segments": 2}, {"focal": np.log(1.3)}], ids=str
+    "doubtful",
+    [{"support": 0.2}, {"on_road": 10}, {"segments": 2}, {"contradicted": 2}, {"focal": np.log(1.3)}],
+    ids=str,
 )
 def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, float]) -> None:
     assert driven(**doubtful) < 0.5 < 0.9 < driven()

@@ -333,5 +333,4 @@ def calibrate_noise(
 
 def main() -> None:
     """Run the command line: known errors become one line and exit code 1."""
-    command_line.Terminal(logging.INFO)
-    command_line.run(app, "erfsfm")
+    command_line.run(app, "erfsfm", logging.INFO)

@@ -330,5 +330,11 @@ def resized_depth(depth: DepthMap, width: int, height: int) -> DepthMap:
     return sampled_depth(depth, *np.meshgrid(u, v))
 
 
+def resized_mask(mask: Mask, width: int, height: int) -> Mask:
+    """The mask ``(height, width)`` of an image resized to so many pixels."""
+    resized = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resized, bool)
+
+
 def _nearest(values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE), np.float32)

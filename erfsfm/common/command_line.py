@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import faulthandler
 import logging
 import os
 import re
 import sys
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -61,11 +63,16 @@ class Terminal(logging.StreamHandler[TextIO]):
         self._times.clear()
 
 
-def run(app: Callable[..., object], name: str) -> None:
-    """Run a command line on ``sys.argv``; a known error becomes one line on stderr and exit code 1."""
+def run(app: Callable[..., object], name: str, level: int) -> None:
+    """Run a command line on ``sys.argv`` that logs from a ``level`` on.
+
+    A known error becomes one line on stderr and exit code 1.
+    """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     for variable, value in _OPENCV.items():
         os.environ.setdefault(variable, value)
+    _quieten_libraries()
+    Terminal(level)
     try:
         require_memory(_LOADING_BYTES)
         _check_current_folder(name)
@@ -81,9 +88,27 @@ def run(app: Callable[..., object], name: str) -> None:
             _say(f"{name}: {why}; what was written stays")
         raise
     except Exception as error:  # the last place where an error can become one line
-        if os.environ.get(SHOW_TRACEBACK, "0") not in ("", "0"):
+        if _shows_all():
             raise
         _end(f"{name}: {_explained(error)}", 1)
+
+
+def _quieten_libraries() -> None:
+    """Only Python writes to standard error: what libraries in C say of a file is said in our own line."""
+    stderr = sys.__stderr__
+    if _shows_all() or stderr is None or sys.stderr is not stderr:
+        return
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+    spoken = os.fdopen(os.dup(2), "w", 1, stderr.encoding, stderr.errors)
+    with Path(os.devnull).open("wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    sys.stderr = spoken
+    faulthandler.enable(spoken)  # what a library says before it crashes is not seen either
+
+
+def _shows_all() -> bool:
+    return os.environ.get(SHOW_TRACEBACK, "0") not in ("", "0")
 
 
 def _check_current_folder(name: str) -> None:

@@ -87,8 +87,8 @@ def open_written(path: str, wait_s: float) -> int:
     return descriptor
 
 
-def read_text(path: Path, encoding: str = "utf-8", most: int = MAX_TEXT_BYTES) -> str:
-    """A text file with the line ends of any system.
+def read_text(path: Path, encoding: str = "utf-8-sig", most: int = MAX_TEXT_BYTES) -> str:
+    """A text file with the line ends of any system, and without the byte order mark of some editors.
 
     Raises:
         OSError: as `read_bytes`.

@@ -47,6 +47,9 @@ def evaluate(
         _compare(paths, reference, frames, format, fail_over or [], as_json, csv, latex, plot)
         return
     files = [Path(path) for path in paths]
+    missing = [str(path) for path in files if not path.exists()]
+    if missing:
+        raise SlamError(f"{', '.join(missing)}: no such file or folder")
     if frames or csv or latex or plot:
         raise typer.BadParameter("--frames, --csv, --latex and --plot need --reference FILE")
     if all(path.is_dir() for path in files):
@@ -57,7 +60,7 @@ def evaluate(
         _evaluate_files(files[0], files[1], format, fail_over or [], as_json)
     else:
         given = ", ".join(paths)
-        raise typer.BadParameter(f"give two trajectory files, run folders that exist, or --reference FILE; got {given}")
+        raise typer.BadParameter(f"give two trajectory files, run folders, or --reference FILE; got {given}")
 
 
 @verbs.command()
@@ -139,10 +142,12 @@ def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
 
 def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
     from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
-    from slam.formats.trajectory import associate, read_trajectory
+    from slam.formats.trajectory import associate
+    from slam.results.systems import trajectory_at
     from slam.results.terminal_tables import metrics_table
+    from slam.runtime.run_files import REFERENCE
 
-    pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
+    pair = associate(trajectory_at(estimate, format), trajectory_at(reference, format, REFERENCE))
     metrics = trajectory_metrics(*pair)
     if as_json:
         typer.echo(metrics.to_json())

@@ -276,7 +276,7 @@ def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
     if path.is_dir():
         raise TrajectoryError(f"{path}: this is a folder, not a trajectory file")
     try:
-        text = read_text(path, "utf-8-sig")
+        text = read_text(path)
     except FileNotFoundError as error:
         raise TrajectoryError(f"{path}: no such file") from error
     except UnicodeDecodeError as error:

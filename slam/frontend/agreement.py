@@ -1,16 +1,21 @@
-"""How far a source of lengths, poses or depth contradicts the images' own motion, by robust statistics."""
+"""How far a source of lengths, poses or depth contradicts the images' own motion, by robust statistics.
+
+Also how far the images of a drive are from those of good drives, and the confidence that follows from both.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slam.frames import Ends, RelativePose
+from slam.frontend.drive import Drive
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.odometry import OdometryState
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 
@@ -23,15 +28,25 @@ _USUAL_HEIGHT_M, _USUAL_FACTOR = 1.0, 10.0  # of cameras whose height nobody sta
 _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
+_FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens bias it
+# of good drives (docs/reliability.md): mean and spread
+_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
+_ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
+_FAR_SPREAD, _FAR_CORNERS = 0.15, 0.05  # of the logarithm; and least corners over the most of a distance
+_CONTRADICTED_SPREAD = 0.007
+_INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
+# share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
+_SIGMAS, _CONFIDENCE = (1.0, 2.0, 3.0, 5.0), (0.97, 0.8, 0.4, 0.1)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """A ``source`` is ``sigmas`` of the stated noise away from what images show; ``figure`` says it in words."""
+    """A ``source`` is ``sigmas`` of the stated noise away from ``beside``; ``figure`` says it in words."""
 
     source: str
     sigmas: float
     figure: str
+    beside: str = "the images"
 
     @property
     def is_wrong(self) -> bool:
@@ -39,11 +54,11 @@ class Agreement:
         return self.sigmas > WRONG
 
     def __str__(self) -> str:
-        return f"{self.source} contradicts the images by {self.sigmas:.1f} sigmas: {self.figure}"
+        return f"{self.source} contradicts {self.beside} by {self.sigmas:.1f} sigmas: {self.figure}"
 
     def said(self) -> Agreement:
         """The same, in the log; as a warning where it is doubtful."""
-        text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with the images: {self.figure}"
+        text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with {self.beside}: {self.figure}"
         logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, "%s", text)
         return self
 
@@ -89,3 +104,67 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
     if spread is None:
         return None
     return Agreement(source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %")
+
+
+def of_images(
+    drive: Drive, odometry: OdometryState, support: FloatArray, contradicted: int, needs_road: bool
+) -> list[Agreement]:
+    """How far the images of a completed drive are from those of good drives, in the log too.
+
+    Args:
+        drive: all its measurements.
+        odometry: what its corners say of the camera and of learned depth.
+        support: of the frames ``(N,)``, by `frame_support`.
+        contradicted: number of steps whose length learned depth or the speed before contradicts.
+        needs_road: whether lengths are measured on the road.
+    """
+    frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
+    steps, on_road, mean = len(drive.steps.triangulated), len(drive.road_steps), float(support.mean())
+    gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
+    figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
+    found = [("gaps", gaps, figure)]
+    if steps:
+        figure = f"learned depth or the speed before contradict {contradicted} of {steps}"
+        found.append(("lengths of steps", contradicted / steps / _CONTRADICTED_SPREAD, figure))
+    if drive.motions or drive.failures or drive.map_poses.segments:  # else nothing was asked of the corners
+        figure = f"{100 * mean:.0f} % of the corners fit in the next image"
+        found.append(("the overlap of images", float(_support_sigmas(mean)), figure))
+    if needs_road and steps >= _LEAST:
+        sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
+        figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
+        found.append(("the view of the road", sigmas, figure))
+    too_far = odometry.depth_error.most_too_far(_FAR_CORNERS)
+    if needs_road and not drive.maps and too_far is not None:
+        figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
+        found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
+    agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]
+    if odometry.focal_length.error is not None:
+        logarithm, sigma = odometry.focal_length.error
+        figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"
+        sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
+        agreements.append(Agreement("the focal length", sigmas, figure))
+    return [each.said() for each in agreements]
+
+
+def frame_support(frames: int, motions: Sequence[Motion], located: Collection[int]) -> FloatArray:
+    """The support of the motion to each frame ``(N,)``, 0 without one; frames ``located`` in a map have the usual."""
+    support = np.zeros(frames)
+    support[list(located)] = _SUPPORT
+    for motion in motions:
+        support[motion.ends[1]] = max(support[motion.ends[1]], motion.support)
+    support[:1] = support[1:2]
+    return support
+
+
+def confidence(agreements: Iterable[Agreement]) -> float:
+    """The share of drives with as large a contradiction that err by at most 1 % of their path."""
+    return float(np.interp(max((each.sigmas for each in agreements), default=0.0), _SIGMAS, _CONFIDENCE))
+
+
+def confidence_of_frames(support: FloatArray) -> FloatArray:
+    """The same for every frame ``(N,)``, by its support alone."""
+    return np.interp(_support_sigmas(support), _SIGMAS, _CONFIDENCE)
+
+
+def _support_sigmas(support: FloatArray | float) -> FloatArray:
+    return np.maximum((_SUPPORT - np.asarray(support)) / _SUPPORT_SPREAD, 0.0)

@@ -1,5 +1,7 @@
 """Detection of images that show nothing new or nothing at all, before they are measured: blank, noise, frozen.
 
+Also of the pixels that stand still while the camera moves: bars, logos, the bonnet of the car.
+
 Whether an image shows the scene of the one before is not asked here: tracking finds out.
 """
 
@@ -12,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Frame, Grey
+from slam.frames import Frame, Grey, Mask
 from slam.frontend.failure import MeasurementFailure
 
 _THUMBNAIL = (32, 16)  # width, height
@@ -27,6 +29,9 @@ _LARGEST_COPY = 2.0
 _EXPOSURE_STEP = 0.1
 _BLANK_CONTRAST = 3.0  # standard deviation of grey levels below which a frame is blank
 _NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below which a frame is noise
+# pixels stand whose grey level changes by less in the mean, and that of half of the others by four times as much
+_STANDING_GREY = 1.0
+_STANDING_IMAGES, _REMEMBERED_IMAGES = 10, 50
 _REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
 
 Verdict = Literal["new", "repeated"] | MeasurementFailure
@@ -39,6 +44,8 @@ class GateState:
 
     ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
     from the one before; of all ``compared`` images, ``exposed`` are much brighter or darker than the one before.
+    ``change`` is the mean change of its pixels over the images that ``moved``, and those pixels are ``standing`` that
+    do not move with the others, None where there are none.
     """
 
     last: Frame | None = None
@@ -47,6 +54,17 @@ class GateState:
     difference: float = 0.0
     compared: int = 0
     exposed: int = 0
+    change: _Layer | None = None
+    moved: int = 0
+    standing: Mask | None = None
+
+    def with_change(self, change: _Layer) -> GateState:
+        """The state after an image whose pixels ``(h, w)`` changed while the camera moved."""
+        moved = self.moved + 1
+        before = change if self.change is None else self.change
+        mean = before + (change - before) / np.float32(min(moved, _REMEMBERED_IMAGES))
+        standing = _standing(mean) if moved % _STANDING_IMAGES == 0 else self.standing
+        return replace(self, change=mean, moved=moved, standing=standing)
 
 
 class ImageGate:
@@ -78,7 +96,7 @@ class ImageGate:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < _BLANK_CONTRAST:
             # images after a dark one are not compared with those before it
-            self._state = GateState(compared=self._state.compared, exposed=self._state.exposed)
+            self._state = replace(self._state, shrunk=None, difference=0.0)
             return MeasurementFailure("the image is blank")
         thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         if float(thumbnail.std()) < _NOISE_CONTRAST * contrast:
@@ -92,7 +110,7 @@ class ImageGate:
         """
         state, before = self._state, self._state.shrunk
         if before is None or before.shape != shrunk.shape:
-            self._state = replace(state, shrunk=shrunk, difference=0.0)
+            self._state = replace(state, shrunk=shrunk, difference=0.0, change=None, moved=0, standing=None)
             return "new"
         is_exposed = abs(float(np.log((np.median(shrunk) + 1.0) / (np.median(before) + 1.0)))) > _EXPOSURE_STEP
         self._state = replace(state, compared=state.compared + 1, exposed=state.exposed + is_exposed)
@@ -101,7 +119,21 @@ class ImageGate:
         if difference < min(largest, _LARGEST_COPY * _REPEAT_DIFFERENCE) and self.was_moving:
             return "repeated"
         self._state = replace(self._state, shrunk=shrunk, difference=difference)
+        if self.was_moving:
+            self._state = self._state.with_change(np.abs(shrunk - before))
         return "new"
+
+
+def _standing(change: _Layer) -> Mask | None:
+    """The pixels ``(h, w)`` that hardly change while most others do, in pieces of at least three by three.
+
+    The pixels beside these belong to them: corners there are seen with a part of both.
+    """
+    if np.median(change) < 4.0 * _STANDING_GREY:
+        return None
+    few, piece = (change < _STANDING_GREY).astype(np.uint8), np.ones((3, 3), np.uint8)
+    pieces = cv2.dilate(cv2.morphologyEx(few, cv2.MORPH_OPEN, piece), piece)
+    return pieces.astype(bool) if pieces.any() else None
 
 
 def _shrunk(grey: Grey) -> _Layer:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Grey
+from slam.frames import Grey, Mask, resized_mask
 
 Pixels = NDArray[np.float32]
 _LIMITS = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
@@ -50,7 +50,22 @@ def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return np.asarray((pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1))
 
 
-def new_corners(grey: Grey, taken: Pixels, count: int, quality: float, spacing_px: float, block_px: int) -> Pixels:
+def are_hidden(pixels: Pixels, hidden: Mask, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which pixels ``(M, 2)`` of an image ``(H, W)`` a mask ``(h, w)`` of any size hides."""
+    sizes = np.array(hidden.shape[::-1])
+    u, v = np.clip((pixels + 0.5) * (sizes / shape[1::-1]), 0, sizes - 1).astype(np.intp).T
+    return np.asarray(hidden[v, u])
+
+
+def new_corners(
+    grey: Grey,
+    taken: Pixels,
+    count: int,
+    quality: float,
+    spacing_px: float,
+    block_px: int,
+    hidden: Mask | None = None,
+) -> Pixels:
     """Up to ``count`` Shi-Tomasi corners ``(M, 2)``, apart from each other and from those taken.
 
     Args:
@@ -60,10 +75,13 @@ def new_corners(grey: Grey, taken: Pixels, count: int, quality: float, spacing_p
         quality: least strength of a corner over that of the strongest one.
         spacing_px: least distance between corners, pixels.
         block_px: side of the surroundings by which a corner is judged, pixels.
+        hidden: where no corner is wanted ``(h, w)``, in any size.
     """
     if count <= 0:
         return np.zeros((0, 2), np.float32)
     free = _away_from(taken, int(spacing_px), grey.shape)
+    if hidden is not None:
+        free[resized_mask(hidden, *grey.shape[::-1])] = 0
     found = cv2.goodFeaturesToTrack(grey, count, quality, spacing_px, mask=free, blockSize=block_px)
     return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 

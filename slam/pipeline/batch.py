@@ -149,6 +149,9 @@ class SlamPipeline:
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
         scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
+        support = agreement.frame_support(len(drive), drive.motions, drive.map_poses.segments)
+        needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
+        of_images = agreement.of_images(drive, state.odometry, support, len(scale.contradicted), needs_road)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         if closure is None:
             with self._watch.stage("loops"):
@@ -177,7 +180,9 @@ class SlamPipeline:
             location=location,
             first=self.first,
             stopwatch=self._watch,
-            agreements=tuple(agreements),
+            agreements=(*agreements, *of_images),
+            confidence=agreement.confidence([*(each for each in agreements if not each.is_wrong), *of_images]),
+            support=support,
         )
 
     def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:

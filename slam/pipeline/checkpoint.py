@@ -29,6 +29,7 @@ from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import OdometryState
@@ -129,8 +130,17 @@ class SessionCheckpoint:
 
 SERIALISER = Serialiser(
     *(SessionCheckpoint, FrontEndState, Drive, GateState, OdometryState, CornerTrackerState, MotionHistory),
-    *(Corners, DepthError, DynamicMask, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
-    *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
+    *(Corners, DepthError, DynamicMask, FocalLength, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose),
+    *(
+        TriangulatedPoints,
+        RelativePose,
+        RelativeRotation,
+        SnippetPoses,
+        RoadStep,
+        GroundPlane,
+        MeasurementFailure,
+        View,
+    ),
     *(KeyframePoses, KeyframeOdometryState, MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent),
 )
 

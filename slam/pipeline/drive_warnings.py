@@ -37,6 +37,12 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
             gate.exposed,
             gate.compared,
         )
+    if gate.standing is not None:
+        logger.warning(
+            "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
+            "road is taken from there",
+            100 * gate.standing.mean(),
+        )
     end = len(drive) - 1
     for first, last in runs(drive.repeated):
         if last == end and end not in drive.interpolated:

@@ -13,6 +13,7 @@ from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale.metric_scale import Scale
+from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
@@ -29,7 +30,8 @@ class Estimate:
     ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
     ``state`` is that of the front end, for a run that continues this one; frames before ``first`` are of earlier runs.
     ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
-    each optional source contradicts the images.
+    each optional source contradicts the images, ``confidence`` what follows from
+    all of them; ``support`` ``(N,)`` is that of the motion to each frame.
     """
 
     network: Trajectory
@@ -47,6 +49,8 @@ class Estimate:
     location: Location | MeasurementFailure | None
     first: int
     stopwatch: Stopwatch
+    confidence: float
+    support: FloatArray
     agreements: tuple[Agreement, ...] = ()
     map: TsdfMap | None = None
 

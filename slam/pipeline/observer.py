@@ -203,7 +203,7 @@ class Observer:
             depth = self._networks.submit(predicted_depth, self._predictor, frame)
         if len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0):
             snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
-        return PendingFrame(frame, depth, snippet)
+        return PendingFrame(frame, depth, snippet, self._gate.state().standing)
 
     def _process_pending(self) -> None:
         """All measurements but the networks' of the pending frame."""
@@ -227,7 +227,7 @@ class Observer:
             self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
             measure = self._config.visual_odometry.enabled and not self._keyframes.measures(self._drive, frame.index)
-            step = self._measure_step(self._recent[-1], frame) if measure and self._recent else None
+            step = self._measure_step(self._recent[-1], pending) if measure and self._recent else None
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
         self._keyframes.choose(self._drive)
@@ -236,7 +236,7 @@ class Observer:
         if rotation is not None:
             self._tasks.append(PendingTask("geometry", self._beside.submit(rotation), self._keep_rotation))
         if self._config.road.enabled and step is not None:
-            self._tasks.append(self._road_task(self._recent[-1].frame, frame, step))
+            self._tasks.append(self._road_task(self._recent[-1].frame, pending, step))
         self._drive.roads.append(MeasurementFailure("its depth was not predicted"))
         self._recent = (*self._recent, RecentFrame(frame, None, None))[
             -self._config.visual_odometry.rotation_baseline_steps :
@@ -244,13 +244,14 @@ class Observer:
         if pending.depth is not None:
             with self._stopwatch.stage("depth network"):
                 depth = pending.depth.result()
-            self._learn(frame, depth)
+            self._learn(pending, depth)
         elif self._keyframes.is_keyframe(frame.index):
             late = self._networks.submit(predicted_depth, self._predictor, frame)
-            self._tasks.append(PendingTask("depth network", late, partial(self._learn, frame)))
+            self._tasks.append(PendingTask("depth network", late, partial(self._learn, pending)))
 
-    def _learn(self, frame: Frame, depth: DepthMap) -> None:
+    def _learn(self, pending: PendingFrame, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
+        frame, depth = pending.frame, pending.visible(depth)
         with self._stopwatch.stage("road"):
             self._drive.roads[frame.index] = road = self._plane.fit(depth, self._odometry.state().depth_error)
         self._keyframes.learn(frame, depth)
@@ -293,10 +294,11 @@ class Observer:
         self._recent = tuple(replace(r, depth=depth, height=height) if r.frame is frame else r for r in self._recent)
         return height
 
-    def _measure_step(self, previous: RecentFrame, current: Frame) -> Motion | None:
+    def _measure_step(self, previous: RecentFrame, pending: PendingFrame) -> Motion | None:
         """The motion from the frame before; None where it could not be measured or triangulated no point."""
         depth, height = self._known(previous)
-        measured = self._odometry.measure(previous.frame, current, depth, height)
+        current = pending.frame
+        measured = self._odometry.measure(previous.frame, current, depth, height, pending.standing)
         if isinstance(measured, MeasurementFailure):
             self._drive.failures.append((previous.frame.index, current.index, measured.reason))
             logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.index, measured.reason)
@@ -321,15 +323,16 @@ class Observer:
         if rotation is not None:
             self._drive.relative_rotations.append(rotation)
 
-    def _road_task(self, previous: Frame, current: Frame, motion: Motion) -> PendingTask:
+    def _road_task(self, previous: Frame, pending: PendingFrame, motion: Motion) -> PendingTask:
         def keep(step: RoadStep | MeasurementFailure) -> None:
             if isinstance(step, RoadStep):
                 self._drive.road_steps[motion.ends] = step
             else:
                 logger.info("road %d -> %d failed: %s", *motion.ends, step.reason)
 
-        T_previous_current = motion.relative_pose.T_from_to
-        return PendingTask("road", self._beside.submit(self._road.measure, previous, current, T_previous_current), keep)
+        frames, T_previous_current = (previous, pending.frame), motion.relative_pose.T_from_to
+        measured = self._beside.submit(self._road.measure, *frames, T_previous_current, pending.standing)
+        return PendingTask("road", measured, keep)
 
     def _finish_tasks(self, stage: str | None = None) -> None:
         """Wait for the tasks of the last frame, or for those of one stage alone."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
+from slam.frames import DepthMap, Frame, Mask, Predictor, SnippetPoses, resized_mask
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
@@ -24,11 +24,21 @@ _LAST_ROADS = 8  # looked back for the camera's height, frames
 
 @dataclass(frozen=True)
 class PendingFrame:
-    """A frame submitted to the networks, whose other measurements are pending; None is not asked for."""
+    """A frame submitted to the networks, whose other measurements are pending; None is not asked for.
+
+    The pixels ``standing`` ``(h, w)`` of its image, in any size, do not belong to the world.
+    """
 
     frame: Frame
     depth: Future[DepthMap] | None
     snippet: Future[SnippetPoses] | None
+    standing: Mask | None
+
+    def visible(self, depth: DepthMap) -> DepthMap:
+        """Depth ``(H, W)``, unknown where pixels stand."""
+        if self.standing is None:
+            return depth
+        return np.where(resized_mask(self.standing, *depth.shape[::-1]), np.float32(0), depth)
 
 
 @dataclass(frozen=True)

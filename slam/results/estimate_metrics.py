@@ -17,6 +17,7 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence, runs
+from slam.frontend.agreement import confidence_of_frames
 from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
@@ -26,6 +27,7 @@ from slam.results.folder import RunFolder
 from slam.results.gps import gps_metrics
 from slam.results.metrics import (
     AgreementMetrics,
+    ConfidenceMetrics,
     CoverageMetrics,
     Event,
     GraphMetrics,
@@ -62,6 +64,9 @@ def estimate_metrics(
         timing=timing_of(result.stopwatch, len(sequence) - result.first),
         scale=_scale(result),
         agreement=[AgreementMetrics(**asdict(each)) for each in result.agreements],
+        confidence=ConfidenceMetrics(
+            run=result.confidence, frames=confidence_of_frames(result.support).round(2).tolist()
+        ),
         trajectories=Trajectories(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),

@@ -92,11 +92,19 @@ class ScaleMetrics(Record):
 
 
 class AgreementMetrics(Record):
-    """How far an optional source contradicts the images, in sigmas of its noise, and what that is."""
+    """How far a source contradicts the images or good drives, in sigmas of its noise, and what that is."""
 
     source: str
+    beside: str = "the images"
     sigmas: Known[float] = MISSING
     figure: Known[str] = MISSING
+
+
+class ConfidenceMetrics(Record):
+    """Share of drives of this kind that err by at most 1 % of their path; of the run and of each frame."""
+
+    run: Known[float] = MISSING
+    frames: Known[list[float]] = MISSING
 
 
 class Trajectories(Record):
@@ -254,6 +262,7 @@ class Metrics(Record):
     timing: Known[Timing] = MISSING
     scale: Known[ScaleMetrics] = MISSING
     agreement: Known[list[AgreementMetrics]] = MISSING
+    confidence: Known[ConfidenceMetrics] = MISSING
     trajectories: Known[Trajectories] = MISSING
     gps: Known[GpsMetrics] = MISSING
     graph: Known[GraphMetrics] = MISSING

@@ -101,8 +101,9 @@ def compare(
     chosen = None if frames is None else frame_range(frames, len(truth))
     runs = []
     for name, path in paths:
+        estimate = trajectory_at(path, format)
         try:
-            pair = associate(trajectory_at(path, format), truth, chosen)
+            pair = associate(estimate, truth, chosen)
         except TrajectoryError as error:
             raise TrajectoryError(f"{path}: {error}") from error
         runs.append(SystemRun(name, path, *pair, trajectory_metrics(*pair)))

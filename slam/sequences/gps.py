@@ -35,7 +35,7 @@ def read_gps(path: Path) -> GpsTrack:
         SequenceError: the file cannot be read or holds something else, with the row.
     """
     try:
-        text = read_text(path, "utf-8-sig")
+        text = read_text(path)
     except OSError as error:
         reason = error.strerror or error
         raise SequenceError(f"{path} cannot be read as a GPS track: {reason}; give a file with --gps") from error
@@ -48,8 +48,10 @@ def read_gps(path: Path) -> GpsTrack:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
     if not len(table):
+        wrong = sum("*" in line and _sentence(line) == [""] for line in lines)
         raise SequenceError(
             f"{path} holds no GPS fix with an altitude: CSV with a header {','.join(_COLUMNS)}, or NMEA is read"
+            + (f"; {wrong} sentences have a wrong checksum" if wrong else "")
         )
     stamps = table[:, 0]
     if (np.diff(stamps) <= 0).any():
@@ -75,7 +77,8 @@ def _require_possible_speed(table: FloatArray, path: Path) -> None:
 
 def _csv_rows(lines: list[str], path: Path) -> list[list[float]]:
     """Rows of stamp, latitude, longitude, altitude, dilution."""
-    reader = csv.DictReader(lines, skipinitialspace=True)
+    delimiter = max(",;\t", key=lines[0].count) if lines else ","
+    reader = csv.DictReader(lines, skipinitialspace=True, delimiter=delimiter)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
         raise SequenceError(f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_COLUMNS)}")

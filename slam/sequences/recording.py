@@ -238,7 +238,11 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
         SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
     """
     try:
-        stamps = np.array([float(line) for line in read_text(path).split()])
+        rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+        wide = next((number for number, row in enumerate(rows, 1) if len(row) > 1), None)
+        if wide is not None:
+            raise ValueError(f"row {wide} holds {len(rows[wide - 1])} words")
+        stamps = np.array([float(word) for (word,) in rows])
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
     return require_stamps(stamps, path, files)

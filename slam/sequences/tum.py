@@ -98,7 +98,7 @@ def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
 
 def _text(path: Path) -> str:
     try:
-        return read_text(path, "utf-8-sig")
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"{path} cannot be read ({error}): it needs rows of 'stamp file' in UTF-8") from error
 

@@ -348,3 +348,20 @@ def test_train_and_resume(run: Run, tmp_path: Path, write_root: Callable[..., Pa
     record = (tmp_path / "run" / "model.yaml").read_text()
     assert "step: 3" in record
     assert "command: erfsfm train --config tiny" in record.replace("\n  ", " ")
+
+
+def test_what_libraries_write_to_standard_error_is_not_seen(tmp_path: Path) -> None:
+    """In a process of its own: the file descriptor is what libraries in C write to."""
+    program = tmp_path / "app.py"
+    program.write_text(
+        "import logging, os, warnings\n"
+        "from erfsfm.common import command_line\n"
+        "def app(args, prog_name):\n"
+        "    os.write(2, b'libpng warning\\n')\n"
+        "    warnings.warn('of a library')\n"
+        "    logging.getLogger('slam').warning('a frame is dark')\n"
+        "    raise OSError('no such drive')\n"
+        "command_line.run(app, 'app', logging.WARNING)\n"
+    )
+    done = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "WARNING slam: a frame is dark\napp: no such drive\n")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import RoadConfig
-from slam.frames import Frame, Intrinsics
+from slam.frames import Frame, Intrinsics, Mask, resized_mask
 from slam.frontend.failure import MeasurementFailure
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
@@ -68,21 +68,28 @@ class RoadHomography:
         long = _Shape(_FAR_HEIGHTS, _HALF_WIDTH_HEIGHTS, _RELATIVE_SIGMA)
         near = _Shape(config.near_heights, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
-        self._strips = [_strip(intrinsics, self._top_row, shape, _POINTS) for shape in (long, near)]
+        self._shapes = long, near
+        self._standing: Mask | None = None
+        self._strips = self._visible(None)
         self._directions = directions
 
     def state(self) -> tuple[FloatArray, ...]:
         """Directions of motion ``(3,)`` of the last steps."""
         return self._directions
 
-    def measure(self, previous: Frame, current: Frame, T_previous_current: FloatArray) -> RoadStep | MeasurementFailure:
+    def measure(
+        self, previous: Frame, current: Frame, T_previous_current: FloatArray, standing: Mask | None = None
+    ) -> RoadStep | MeasurementFailure:
         """Measure the length of a step whose rotation and direction are known.
 
         Args:
             previous: the earlier frame, at the size of the intrinsics.
             current: the later frame.
             T_previous_current: its pose in the earlier camera, of any length but zero.
+            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where all do.
         """
+        if standing is not self._standing:
+            self._standing, self._strips = standing, self._visible(standing)
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions = (*self._directions, T_unit[:3, 3])[-_STEPS_KEPT:]
@@ -93,6 +100,12 @@ class RoadHomography:
             return measured
         nearby = self._measured_on(near, previous, current, T_unit, expected)
         return nearby if isinstance(nearby, RoadStep) else measured
+
+    def _visible(self, standing: Mask | None) -> list[_Strip]:
+        camera = self._intrinsics
+        hidden = np.zeros((1, 1), bool) if standing is None else standing
+        visible = ~resized_mask(hidden, camera.width, camera.height)[self._top_row :]
+        return [_strip(camera, self._top_row, shape, _POINTS, visible) for shape in self._shapes]
 
     def _measured_on(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
@@ -229,12 +242,13 @@ class _Strip:
         return np.asarray(grey - blurred[self.places] / self.coverage[self.places])
 
 
-def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> _Strip:
+def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int, visible: Mask) -> _Strip:
     v, u = np.mgrid[top_row : intrinsics.height, : intrinsics.width]
     rays = intrinsics.rays(np.stack([u, v], axis=-1))
     depth_heights = 1.0 / np.maximum(rays[..., 1], 1e-6)
     seen = (depth_heights < shape.far_heights) & (np.abs(rays[..., 0] * depth_heights) < shape.half_width_heights)
     step = max(round(float(np.sqrt(seen.sum() / points))), 1)
+    seen &= visible
     rows, columns = np.nonzero(seen & (v % step == 0) & (u % step == 0))
     places = rows // step, columns // step
     mask = np.zeros((len(seen) // step + 1, intrinsics.width // step + 1), np.float32)

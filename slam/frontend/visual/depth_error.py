@@ -75,6 +75,16 @@ class DepthError:
         np.add.at(corners, (_nearest(np.log2(learned[known]), np.log2(_DEPTHS)), _nearest(logarithms, _LOGARITHMS)), 1)
         return type(self)(corners)
 
+    def most_too_far(self, least: float) -> float | None:
+        """The largest bias towards far; None without corners.
+
+        Args:
+            least: corners at a distance, over the most at any, that its bias counts.
+        """
+        corners = self.corners.sum(axis=1)
+        counted = self.bias[corners > least * corners.max()]
+        return float(counted.max()) if len(counted) else None
+
     def curve(self) -> list[tuple[float, float, float, float]]:
         """Learned depth, its bias (logarithm), its relative sigma and the corners seen there, where there are many."""
         corners = self.corners.sum(axis=1)

@@ -6,13 +6,14 @@ A motion is ``x_current ~ R_current_previous @ X_previous + direction``; ``front
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
 
 from slam.frames import Intrinsics
 from slam.geometry.resection import consensus, ransac_order
-from slam.geometry.se3 import FloatArray, nearest_rotation
+from slam.geometry.se3 import FloatArray, invert, nearest_rotation
 
 _TRIMMINGS = 4
 _RESECTIONS = 200
@@ -25,6 +26,13 @@ class UnitRelativePose:
 
     R_current_previous: FloatArray
     direction: FloatArray
+
+    @classmethod
+    def of(cls, T_previous_current: FloatArray) -> tuple[Self, float] | None:
+        """That of a pose, and its length; None where it has none."""
+        T_current_previous = invert(T_previous_current)
+        length = float(np.linalg.norm(T_current_previous[:3, 3]))
+        return (cls(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length) if length > 0 else None
 
 
 def unit_pose_by_essential(

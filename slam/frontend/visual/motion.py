@@ -19,13 +19,15 @@ class Motion:
 
     Where corners alone gave rotation and direction, ``direction_sigmas`` ``(3,)`` are the noise of the direction in the
     later camera, radians, and ``length_ratio`` is the log of the length over that of the step before, by points that
-    both triangulated, with its sigma; else None. ``seconds`` passed between the frames.
+    both triangulated, with its sigma; else None. ``seconds`` passed between the frames. ``support`` is the share of the
+    earlier frame's corners that were found again and fit the motion.
     """
 
     relative_pose: RelativePose
     direction_sigmas: FloatArray | None = None
     length_ratio: tuple[float, float] | None = None
     seconds: float = np.nan
+    support: float = np.nan
 
     @property
     def ends(self) -> Ends:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose, nearest_depth
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, nearest_depth
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
@@ -24,6 +24,7 @@ from slam.frontend.visual.epipolar import (
     rotation_between,
     triangulated_depth,
 )
+from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, pose_sigmas
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.predicted_flow import PredictedFlow
@@ -76,6 +77,7 @@ class OdometryState:
     dynamic_mask: DynamicMask
     history: MotionHistory
     depth_error: DepthError
+    focal_length: FocalLength = field(default_factory=FocalLength)
     last: Motion | None = None
     points: TriangulatedPoints | None = None
 
@@ -114,6 +116,7 @@ class VisualOdometry:
         current: Frame,
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
+        standing: Mask | None = None,
     ) -> Motion | MeasurementFailure:
         """Measure the motion between two frames, the next two of the sequence or with others left out between them.
 
@@ -123,11 +126,12 @@ class VisualOdometry:
             depth_previous_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
             height_unscaled: camera height in the same unit; where known, farther depths than
                 ``max_depth_heights`` of it are not trusted.
+            standing: pixels ``(h, w)`` that do not show the world, of images of any size; None where all do.
         """
         previous, current = self._working.frame(previous), self._working.frame(current)
         depth_previous_unscaled = self._working.depth(depth_previous_unscaled)
         flow = self._predicted_flow(previous, current, depth_previous_unscaled)
-        tracks = self._tracker.track(previous, current, flow)
+        tracks = self._tracker.track(previous, current, flow, standing)
         if len(tracks) < self._config.min_inliers:
             measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
         else:
@@ -149,7 +153,7 @@ class VisualOdometry:
             depth_previous_unscaled: z-depth ``(H, W)`` of the earlier frame.
             motion: from it.
         """
-        known = _unit_pose_and_length(motion.relative_pose.T_from_to)
+        known = UnitRelativePose.of(motion.relative_pose.T_from_to)
         if known is None:
             return None
         return PredictedFlow(*known, self._working.depth(depth_previous_unscaled), self._intrinsics).depth_current()
@@ -168,7 +172,7 @@ class VisualOdometry:
         Returns:
             A function that measures it from the present state, in any thread; its result is None with too few corners.
         """
-        known = _unit_pose_and_length(T_first_last)
+        known = UnitRelativePose.of(T_first_last)
         if known is None:
             return lambda: None
         first, last = self._working.frame(first), self._working.frame(last)
@@ -196,7 +200,7 @@ class VisualOdometry:
             return None
         if last.ends[1] - last.ends[0] != current.index - previous.index:
             return None
-        known = _unit_pose_and_length(last.relative_pose.T_from_to)
+        known = UnitRelativePose.of(last.relative_pose.T_from_to)
         return None if known is None else PredictedFlow(*known, depth_previous, self._intrinsics)
 
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
@@ -222,7 +226,7 @@ class VisualOdometry:
         typical_radius_px = 0.25 * self._intrinsics.width
         translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
         sigmas = np.repeat([_LEAST_ROTATION_SIGMA, translation], 3)
-        return Motion(RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE))
+        return Motion(RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE), support=len(tracks) / tracks.sought)
 
     def _by_essential(
         self, frames: tuple[Frame, Frame], tracks: Tracks, learned: FloatArray, height: float | None
@@ -264,13 +268,14 @@ class VisualOdometry:
         """Learn from a trusted step where objects move, how the camera moves, and the error of learned depth."""
         state, two_view = self._state, step.two_view
         still = two_view.inliers & (matches.weights > 0.5)
-        rays_previous, rays_current = matches.rays_previous[still], matches.rays_current[still]
-        nearness = 1.0 / triangulated_depth(rays_previous, rays_current, two_view.unit_pose)
+        rays = matches.rays_previous[still], matches.rays_current[still]
+        nearness = 1.0 / triangulated_depth(*rays, two_view.unit_pose)
         self._state = replace(
             state,
             dynamic_mask=state.dynamic_mask.updated(tracks.current, two_view.inliers),
             history=state.history.with_step(two_view.unit_pose, step.inlier_ratio, speed),
             depth_error=state.depth_error.with_step(learned[still], nearness, step.motion.length_unscaled),
+            focal_length=state.focal_length.with_step(*rays, two_view.unit_pose, self._intrinsics.fx),
             points=step.points,
         )
 
@@ -308,7 +313,8 @@ class VisualOdometry:
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
         ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
         sigmas = pose_sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
-        motion = Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), direction, ratio, seconds)
+        pose = RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE)
+        motion = Motion(pose, direction, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)
 
     def _essential_sigmas(self, two_view: TwoViewEstimate) -> tuple[FloatArray, FloatArray]:
@@ -336,14 +342,5 @@ class VisualOdometry:
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
-        return Motion(RelativePose(*ends, invert(resection.T_camera_points), sigmas, PNP_SOURCE))
-
-
-def _unit_pose_and_length(T_previous_current: FloatArray) -> tuple[UnitRelativePose, float] | None:
-    T_current_previous = invert(T_previous_current)
-    length = float(np.linalg.norm(T_current_previous[:3, 3]))
-    return (
-        (UnitRelativePose(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length)
-        if length > 0
-        else None
-    )
+        pose = RelativePose(*ends, invert(resection.T_camera_points), sigmas, PNP_SOURCE)
+        return Motion(pose, support=count / tracks.sought)

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frames import Frame, Grey
-from slam.frontend.sparse_flow import Pixels, are_inside, lucas_kanade, new_corners
+from slam.frames import Frame, Grey, Mask
+from slam.frontend.sparse_flow import Pixels, are_hidden, are_inside, lucas_kanade, new_corners
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.geometry.se3 import FloatArray
 
@@ -34,12 +34,13 @@ _WINDOW_PX = 11  # side of the Lucas-Kanade window, pixels
 class Tracks:
     """The same ``M`` scene points in two images: pixels ``(M, 2)`` each, and ``track_ids`` ``(M,)``.
 
-    A corner keeps its identifier from frame to frame for as long as it is tracked.
+    A corner keeps its identifier from frame to frame for as long as it is tracked. So many were ``sought``.
     """
 
     previous: FloatArray
     current: FloatArray
     track_ids: NDArray[np.int64]
+    sought: int
 
     def __len__(self) -> int:
         return len(self.track_ids)
@@ -73,16 +74,28 @@ class CornerTracker:
         """The state to resume from."""
         return self._state
 
-    def track(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow | None = None) -> Tracks:
-        """Corners of ``previous`` tracked to ``current``, with the flow predicted between them, if any."""
+    def track(
+        self,
+        previous: Frame,
+        current: Frame,
+        predicted_flow: PredictedFlow | None = None,
+        standing: Mask | None = None,
+    ) -> Tracks:
+        """Corners of ``previous`` tracked to ``current``.
+
+        The flow between them may be predicted; pixels that are ``standing`` ``(h, w)`` do not belong to the world.
+        """
         corners = self._state.corners.get(previous.index)
         if corners is None:
-            corners = self._filled(previous, _no_corners())
+            corners = self._filled(previous, _no_corners(), standing)
         forward, kept = self._tracked(previous, current, corners.pixels, predicted_flow)
+        if standing is not None:
+            kept &= ~are_hidden(forward, standing, current.grey.shape)
         track_ids = corners.track_ids[kept]
         if current.index not in self._state.corners:
-            self._filled(current, Corners(forward[kept], track_ids))
-        return Tracks(corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), track_ids)
+            self._filled(current, Corners(forward[kept], track_ids), standing)
+        before, now = corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
+        return Tracks(before, now, track_ids, len(kept))
 
     def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
         """Prepare to track corners of ``previous`` to a frame some steps later.
@@ -92,7 +105,7 @@ class CornerTracker:
         corners = self._state.corners.get(previous.index)
         following = min((index for index in self._state.corners if index > previous.index), default=None)
         if corners is None or following is None:
-            return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64))
+            return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
         tracked = np.isin(corners.track_ids, self._state.corners[following].track_ids)
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
@@ -100,7 +113,8 @@ class CornerTracker:
             target = _warped(current.grey, _WINDOW_PX, predicted_flow)
             found = self._first_flow(previous.grey, current.grey, points, [target])
             pixels, kept = found.pixels, found.kept
-            return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), track_ids[kept])
+            before, now = points[kept].astype(np.float64), pixels[kept].astype(np.float64)
+            return Tracks(before, now, track_ids[kept], len(kept))
 
         return find
 
@@ -115,13 +129,14 @@ class CornerTracker:
             found = max(found, wider, key=lambda tracked: tracked.kept.sum())
         return found.pixels, found.kept
 
-    def _filled(self, frame: Frame, arrived: Corners) -> Corners:
+    def _filled(self, frame: Frame, arrived: Corners, standing: Mask | None) -> Corners:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
         config, next_id = self._config, self._state.next_track_id
         pixels, track_ids = arrived.pixels, arrived.track_ids
         room = config.max_corners - len(pixels)
         if room > 0:
-            fresh = new_corners(frame.grey, pixels, room, _CORNER_QUALITY, config.corner_spacing_px, _CORNER_BLOCK_PX)
+            wanted = room, _CORNER_QUALITY, config.corner_spacing_px, _CORNER_BLOCK_PX
+            fresh = new_corners(frame.grey, pixels, *wanted, standing)
             pixels = np.concatenate([pixels, fresh])
             track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])
             next_id += len(fresh)

@@ -101,7 +101,7 @@ def what_ran(metrics: Metrics) -> Table:
         ("True length", text(sequence.length_m, unit=" m")),
         ("Frame rate", text(sequence.fps, unit=" frames/s")),
         ("Scale", f"mode {text(scale.mode)}, value {text(scale.value, 4)}"),
-        *((f"{each.source} beside the images", _agreement(each)) for each in known(metrics.agreement) or ()),
+        *((f"{each.source} beside {each.beside}", _agreement(each)) for each in known(metrics.agreement) or ()),
         ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
         ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
         ("Noise of the poses", noise if DASH in noise else f"noise.yaml, sha256 {noise}"),

@@ -101,7 +101,7 @@ class Record(BaseModel):
             RunError: damaged, too large, nested without end, or a value of another kind; one line.
         """
         try:
-            content = json.loads(read_text(path, "utf-8-sig", _MAX_BYTES), parse_constant=_refused)
+            content = json.loads(read_text(path, most=_MAX_BYTES), parse_constant=_refused)
             json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
             return cls.model_validate(content)
         except FileNotFoundError:

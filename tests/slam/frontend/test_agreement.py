@@ -9,9 +9,17 @@ import pytest
 
 from slam.frames import RelativePose
 from slam.frontend import agreement
+from slam.frontend.drive import Drive
+from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
+from slam.frontend.segments import Segment
 from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.dynamic_mask import DynamicMask
+from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.odometry import OdometryState
+from slam.frontend.visual.tracking import CornerTrackerState
 from slam.geometry import se3
 
 FRAMES = 40
@@ -60,3 +68,35 @@ def test_disparity_that_is_read_as_depth_is_doubtful() -> None:
     assert agreement.of_depth("png:depth", DepthError()) is None
     sigmas = [found.sigmas for error in (right, inverse) if (found := agreement.of_depth("png:depth", error))]
     assert sigmas[0] < 1 and sigmas[1] > agreement.DOUBTFUL
+
+
+def driven(
+    support: float = 0.7, on_road: int = FRAMES, segments: int = 1, contradicted: int = 0, focal: float = 0.0
+) -> float:
+    """The confidence of a drive by its images."""
+    poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
+    drive = Drive(
+        motions=[Motion(pose, np.full(3, 0.01), support=support) for pose in poses],
+        road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
+        roads=[MeasurementFailure("not asked")] * (FRAMES + 1),
+        segments=[Segment(k, k, "another place") for k in range(segments)],
+    )
+    tracker, mask = CornerTrackerState({}), DynamicMask.empty(416, 128, 1.0)
+    camera = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
+    by_frame = agreement.frame_support(len(drive), drive.motions, ())
+    return agreement.confidence(agreement.of_images(drive, camera, by_frame, contradicted, needs_road=True))
+
+
+@pytest.mark.parametrize(
+    "doubtful",
+    [{"support": 0.2}, {"on_road": 10}, {"segments": 2}, {"contradicted": 2}, {"focal": np.log(1.3)}],
+    ids=str,
+)
+def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, float]) -> None:
+    assert driven(**doubtful) < 0.5 < 0.9 < driven()
+
+
+def test_a_frame_without_a_motion_has_no_confidence() -> None:
+    motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
+    found = agreement.confidence_of_frames(agreement.frame_support(4, motions, {3}))
+    assert found[0] == found[1] == found[3] > 0.9 > 0.2 > found[2]

@@ -250,9 +250,9 @@ def predictions(texture, steps, failing=()) -> dict[tuple[int, int], bool]:
 
     track = CornerTracker.track
 
-    def watched(self, previous, current, flow=None):
+    def watched(self, previous, current, flow=None, standing=None):
         predicted[previous.index, current.index] = flow is not None
-        return track(self, previous, current, flow)
+        return track(self, previous, current, flow, standing)
 
     odometry = VisualOdometry(CONFIG, CAMERA)
     with pytest.MonkeyPatch.context() as patch:

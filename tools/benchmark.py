@@ -5,7 +5,8 @@ cameras, ablation turns off one part at a time, maps the errors of the map with 
 Every run is a process and a folder of its own under --output. A successful one is not repeated as long as sources,
 weights and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its reason.
 --jobs and --scheduler need Dask: pip install 'erfsfm-slam[cluster]'. A scheduler's workers need the same files at the
-same paths. speed measures two checkouts in turn: time, memory and stages; nothing of it is kept.
+same paths. kitti runs whole sequences of KITTI odometry, 09 and 10 first, and says first how long that will take. speed
+measures two checkouts in turn: time, memory and stages; nothing of it is kept.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -17,12 +18,13 @@ import csv
 import os
 import shlex
 import shutil
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from benchmarking import pairs
+from benchmarking import kitti, pairs
 from benchmarking.metrics import rows
 from benchmarking.page import PICTURE, draw, drawable, section, speed_section, summary_table, with_section
 from benchmarking.plan import (
@@ -31,6 +33,7 @@ from benchmarking.plan import (
     EVERYTHING,
     FULL_SIZE,
     MAPS,
+    WHOLE,
     Condition,
     Configuration,
     Job,
@@ -71,6 +74,7 @@ MODES = {
     "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", ACCURACY, _BOTH, (610, 611)),
     "ablation": Mode("the same with one part turned off at a time", ABLATION, _BOTH, weights=("default", "sim")),
     "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", MAPS, ("loop",)),
+    "kitti": Mode("whole sequences of KITTI odometry, beside published errors", WHOLE, (), weights=("sim",)),
 }
 
 
@@ -83,7 +87,7 @@ def main(words: Sequence[str] | None = None) -> None:
         return
     at_a_time = getattr(options, "jobs", 1)
     scheduler = getattr(options, "scheduler", None)
-    jobs = _jobs(options)
+    jobs = _whole_sequences(options) if options.mode == "kitti" else _jobs(options)
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or --kitti")
     with workers(at_a_time, scheduler) as spread:
@@ -96,12 +100,14 @@ def main(words: Sequence[str] | None = None) -> None:
     drives = [(path, "DRIVE") for path in getattr(options, "drives", ())]
     text = section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
     roots = (getattr(options, "kitti", None), "KITTI"), (getattr(options, "data", None), "DATA")
-    known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), *roots, (ROOT, "."), *drives
+    known = (options.output, "OUTPUT"), (getattr(options, "worlds_in", None), "WORLDS"), *roots, (ROOT, "."), *drives
     for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
     _write_section(options.report, text)
     if options.mode in ("accuracy", "full-size"):
         print(summary_table(results))
+    if options.mode == "kitti":
+        print(kitti.tables(results))
     if options.mode == "accuracy" and drawable(results):
         draw(results, options.report.parent / PICTURE)
     print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
@@ -157,6 +163,23 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     return plan(folder, drives, configurations, *rest)
 
 
+def _whole_sequences(options: argparse.Namespace) -> list[Job]:
+    """The sequences that are there; says which are not, and how long the others take."""
+    root = options.kitti.resolve()
+    frames, absent = kitti.present(root, options.sequences)
+    for line in absent:
+        print(f"left out: {line}", file=sys.stderr)
+    if not frames:
+        raise SystemExit(
+            f"nothing to measure: {root} has none of these sequences with true poses; give another --kitti"
+        )
+    rest = options.weights, options.seeds, options.set, options.device
+    folder = options.output.resolve() / options.mode
+    jobs = plan(folder, recordings(root, list(frames), None), MODES["kitti"].configurations, *rest)
+    print(kitti.time_to_go(jobs, frames, options.jobs), file=sys.stderr)
+    return jobs
+
+
 def _command(options: argparse.Namespace) -> str:
     """The command with its defaults, without the paths and hosts of one machine."""
     words = ["python", "tools/benchmark.py", options.mode]
@@ -196,20 +219,18 @@ def _parser() -> argparse.ArgumentParser:
             data = os.environ.get("ERFSFM_DATA")
             add("--data", type=Path, default=data and Path(data), metavar="FOLDER", help="recordings; $ERFSFM_DATA")
         else:
-            add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure too")
+            add("--kitti", type=Path, metavar="ROOT", required=name == "kitti", help="a KITTI odometry root to measure")
             add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
-            add("--excerpt", metavar="A:B", help="frames of those sequences, half-open")
-        add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
-        add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
-        add("--frames", type=int, default=300, help="their length")
-        add("--conditions", nargs="+", choices=get_args(Condition), default=["clean"], help="hazards: all at once")
-        add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
+        if name != "kitti":
+            _add_worlds(add, mode)
         add("--weights", nargs="+", default=mode.weights, help="names or folders")
         add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")
         add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
         add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
         add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
+        if name in ("accuracy", "ablation", "maps"):
+            add("--excerpt", metavar="A:B", help="frames of the sequences of --kitti, half-open")
         if name in ("maps", "ablation"):
             add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
             parts = [each.name for each in mode.configurations if each is not EVERYTHING]
@@ -229,6 +250,15 @@ def _parser() -> argparse.ArgumentParser:
     add("--output", type=Path, default=Path("runs/benchmark"), help="keeps the last runs and the world")
     add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
     return parser
+
+
+def _add_worlds(add: Callable[..., object], mode: Mode) -> None:
+    """The options of simulated worlds."""
+    add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
+    add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
+    add("--frames", type=int, default=300, help="their length")
+    add("--conditions", nargs="+", choices=get_args(Condition), default=["clean"], help="hazards: all at once")
+    add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
 
 
 if __name__ == "__main__":

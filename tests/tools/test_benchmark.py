@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -269,3 +270,37 @@ def test_maps_need_depth_maps_beside_the_images_and_name_every_part(tmp_path: Pa
     results = [work.JobResult(job, Metrics.model_validate({"map": errors | {"submaps": 3}}), "abc") for job in jobs]
     text = page.maps_tables(results)
     assert "| loop 610 | default | no sky | 0.100 | 0.50 |" in text and "drive_0013" in text
+
+
+def test_whole_sequences_of_kitti_begin_with_what_they_take_and_go_on_where_they_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world, root = tmp_path / "world", tmp_path / "root"
+    shape = ("--route", "straight", "--width", "208", "--height", "64", "--frames", "8", "--seed", "1")
+    work.simulate(plan.BenchmarkSequence("world", world, simulate=shape))
+    (root / "poses").mkdir(parents=True)
+    for name in ("05", "09"):
+        shutil.copytree(world / "sequences" / "sim", root / "sequences" / name)
+    shutil.copy(world / "poses" / "sim.txt", root / "poses" / "09.txt")
+    page_of_runs = tmp_path / "page.md"
+    words = ["kitti", "--kitti", str(root), "--output", str(tmp_path / "out"), "--report", str(page_of_runs)]
+    benchmark.main(words)
+    said = capsys.readouterr().err
+    assert "not in" in said and "10, 00, 01, 02, 03, 04, 06, 07, 08" in said and "05, which has no true poses" in said
+    assert "0 of 1 runs are done. To run: KITTI 09 (8); 8 frames, about 1 min" in said
+    head, row = cells(page_of_runs.read_text())
+    assert row[0] == "KITTI 09" and float(row[head.index("scale")]) > 0
+    assert row[head.index("published, 7-dof")] == "–"  # 8 frames are not the sequence
+
+    (record,) = (tmp_path / "out" / "kitti").glob("*/record.json")
+    before = record.stat().st_mtime_ns
+    benchmark.main(words)
+    assert "1 of 1 runs are done. To run: none" in capsys.readouterr().err
+    assert record.stat().st_mtime_ns == before
+
+
+def test_whole_sequences_stand_beside_published_errors(job: Any) -> None:
+    whole = metrics().changed(sequence=SequenceMetrics(frames=1591, length_m=1705.0))
+    drive = plan.BenchmarkSequence("KITTI 09", job.drive.root)
+    text = page.section("kitti", "", [work.JobResult(replace(job, drive=drive), whole, "abc")], "1")
+    assert text.startswith("## KITTI\n") and "| 3.94 (GigaSLAM) |" in text

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+from benchmarking import kitti
 from benchmarking import metrics as m
 from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, over_seeds, table, values, weights
 from benchmarking.plan import EVERYTHING
@@ -100,6 +101,7 @@ TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
     "full-size": error_tables,
     "ablation": ablation_tables,
     "maps": maps_tables,
+    "kitti": lambda results: kitti.tables(results) + notes(results, kitti.MEASURED),
 }
 
 
@@ -138,7 +140,7 @@ def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: st
     commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in results))
     seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
     failed = sum(bool(o.reason) for o in results)
-    return f"""## {mode.capitalize()}
+    return f"""## {_title(mode)}
 
     {command}
 
@@ -147,6 +149,10 @@ Commit {commits}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_tim
 
 {TABLES[mode](results)}
 """
+
+
+def _title(mode: str) -> str:
+    return "KITTI" if mode == "kitti" else mode.capitalize()
 
 
 def speed_section(command: str, tables: str) -> str:
@@ -165,7 +171,7 @@ def with_section(page: str, new: str) -> str:
     """The page with a section in place of the one of the same title; those that no mode writes come last."""
     _, *old = re.split(r"(?m)^(?=## )", page)
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
-    order = [f"## {mode.capitalize()}" for mode in (*TABLES, "speed")]
+    order = [f"## {_title(mode)}" for mode in (*TABLES, "speed")]
     place = {title: number for number, title in enumerate(order)}
     return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=lambda t: place.get(t, len(order))))])
 

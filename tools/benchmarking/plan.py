@@ -42,6 +42,7 @@ _UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
 _NEVER = 1e9  # a limit that no measurement reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
+WHOLE = (Configuration("no map", (*QUIET, "mapping.enabled=false")),)
 EVERYTHING = Configuration("everything on", QUIET, True)
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("visual_odometry.enabled=false",),

@@ -81,19 +81,27 @@ def simulate(drive: BenchmarkSequence) -> None:
 
 def perform(job: Job) -> None:
     """Run a job and write ``record.json`` to its folder, unless the same job was successful before."""
-    identity = {"arguments": job.arguments, "sources": fingerprint(job.weights)}
-    kept = _read(job.place / "record.json")
-    if kept.get("identity") == identity and not _read_result(job, kept).reason:
+    if is_done(job):
         return
     shutil.rmtree(job.place, ignore_errors=True)
     job.place.mkdir(parents=True)
-    record = {"identity": identity, "commit": revision(), "load": os.getloadavg()[0]}
+    record = {"identity": _identity(job), "commit": revision(), "load": os.getloadavg()[0]}
     start = time.perf_counter()
     finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
     record |= {"seconds": time.perf_counter() - start, "reason": why_ended(finished.returncode, finished.stderr)}
     for name in BULKY:
         (job.place / "run" / name).unlink(missing_ok=True)
     write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
+
+
+def is_done(job: Job) -> bool:
+    """Whether the same job was successful before."""
+    kept = _read(job.place / "record.json")
+    return kept.get("identity") == _identity(job) and not _read_result(job, kept).reason
+
+
+def _identity(job: Job) -> dict[str, Any]:
+    return {"arguments": job.arguments, "sources": fingerprint(job.weights)}
 
 
 def job_result(job: Job) -> JobResult:

@@ -15,7 +15,7 @@ Condition = Literal["clean", "hazards"]
 class BenchmarkSequence:
     """A recording; one with ``simulate`` is made by ``erfsfm-slam simulate`` with those options.
 
-    ``sequence`` is empty for a root that is one recording.
+    ``sequence`` is empty for a root that is one recording; ``truth`` is a file of its true poses.
 
     Drives of one ``kind`` are a row of the summary; ``clean`` names the same drive without hazards.
     """
@@ -27,6 +27,7 @@ class BenchmarkSequence:
     simulate: tuple[str, ...] = ()
     kind: str = ""
     clean: str = ""
+    truth: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class Job:
         words += ["--sequence", drive.sequence] if drive.sequence else []
         words += ["--seed", str(self.seed), "--device", self.device, "--output", str(self.place / "run")]
         words += ["--frames", drive.frames] if drive.frames else []
+        words += ["--truth", str(drive.truth)] if drive.truth else []
         words += ["--cache", str(self.cache)] if configuration.cache else []
         return words + [word for override in configuration.overrides for word in ("--set", override)]
 

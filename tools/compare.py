@@ -2,7 +2,7 @@
 
 ORB-SLAM3 runs through the wheel pyorbslam3 in an environment of its own: it is no dependency of this project. Both get
 the same images: ORB-SLAM3 as grey pixels, decoded and undistorted beforehand. It needs a vocabulary of ORB descriptors
-in DBoW2's text form, such as ORBvoc.txt. Each recording is run once; runs that ended well are kept under --output.
+in DBoW2's text form, such as ORBvoc.txt. Runs that ended well are kept under --output.
 
 Example: python tools/compare.py --data DATA --orb-python ORB_ENV/bin/python --vocabulary ORBvoc.txt
 """
@@ -105,8 +105,8 @@ def main(words: Sequence[str] | None = None) -> None:
         raise SystemExit(f"nothing to compare in {data}: it holds none of {', '.join(each.name for each in chosen)}")
     pairs = []
     for each in there:
-        pairs.append(_pair(each, data, options))
-        print(f"{len(pairs)} of {len(there)} recordings: {each.name}", file=sys.stderr)
+        pairs += _pairs(each, data, options)
+        print(f"{len(pairs) // options.runs} of {len(there)} recordings: {each.name}", file=sys.stderr)
     text = page(pairs, _command(options), options.about_vocabulary or options.vocabulary.name, options.pace)
     write_atomically(options.report, lambda file: file.write_text(text, encoding="utf-8"))
     print(text)
@@ -117,13 +117,15 @@ def _is_there(each: Compared, data: Path) -> bool:
     return (path / "sequences" / each.sequence if each.sequence else path).is_dir()
 
 
-def _pair(each: Compared, data: Path, options: argparse.Namespace) -> Pair:
+def _pairs(each: Compared, data: Path, options: argparse.Namespace) -> list[Pair]:
+    """Our runs beside every run of ORB-SLAM3."""
     drive, folder = each.drive(data), options.output.resolve()
     with_map, without = plan(folder, [drive], (WITH_MAP, *WHOLE), [options.weights], [0])
     for job in (with_map, without):
         perform(job)
-    peer = _peer_run(each, drive, folder / f"orbslam3-{slug(each.name)}", options)
-    return Pair(each.name, job_result(with_map), job_result(without), peer)
+    ours = job_result(with_map), job_result(without)
+    places = (folder / f"orbslam3-{slug(each.name)}-{number}" for number in range(options.runs))
+    return [Pair(each.name, *ours, _peer_run(each, drive, place, options)) for place in places]
 
 
 def _peer_run(each: Compared, drive: BenchmarkSequence, folder: Path, options: argparse.Namespace) -> PeerRun:
@@ -168,9 +170,10 @@ def _write_recording(drive: BenchmarkSequence, features: int, folder: Path) -> N
 def page(pairs: Sequence[Pair], command: str, vocabulary: str, pace: float) -> str:
     """The page of all recordings."""
     accuracy = markdown(list(_ACCURACY), [[cell(pair) for cell in _ACCURACY.values()] for pair in pairs], numbers=8)
-    cost = markdown(list(_COST), [[cell(pair) for cell in _COST.values()] for pair in pairs], numbers=9)
+    first = list({pair.name: pair for pair in reversed(pairs)}.values())[::-1]
+    cost = markdown(list(_COST), [[cell(pair) for cell in _COST.values()] for pair in first], numbers=9)
     failed = "".join(f"\n- ORB-SLAM3 failed on {p.name}: {p.peer.reason}" for p in pairs if p.peer.reason)
-    without, with_map = [p.without_map for p in pairs], [p.with_map for p in pairs]
+    without, with_map = [p.without_map for p in first], [p.with_map for p in first]
     return _PAGE.format(
         command=command,
         commits=", ".join(dict.fromkeys(o.commit or "unknown" for o in (*without, *with_map))),
@@ -236,47 +239,50 @@ _ACCURACY: dict[str, Callable[[Pair], str]] = {
     "path (m)": _of(m.LENGTH, _without),
     "poses, ours": lambda pair: _poses(_ours(pair)),
     "poses, ORB-SLAM3": lambda pair: _poses(pair.peer.trajectory),
-    "ATE of both's frames, ours": lambda pair: _ate(_ours(pair), _ours(pair, "reference"), pair.peer.trajectory),
-    "ATE of both's frames, ORB-SLAM3": lambda pair: _ate(pair.peer.trajectory, _ours(pair, "reference")),
-    "ATE of all frames, ours": lambda pair: _ate(_ours(pair), _ours(pair, "reference")),
-    "the same, 6-dof": _metric,
+    "ATE, ours": lambda pair: _ate(_ours(pair), _ours(pair, "reference"), pair.peer.trajectory),
+    "ATE, ORB-SLAM3": lambda pair: _ate(pair.peer.trajectory, _ours(pair, "reference")),
+    "all frames, ours": lambda pair: _ate(_ours(pair), _ours(pair, "reference")),
+    "all frames, 6-dof": _metric,
 }
 _COST: dict[str, Callable[[Pair], str]] = {
     "recording": lambda pair: pair.name,
     "CPU ms / frame, ours": _of(m.CPU, _without),
-    "with the map": _of(m.CPU, _with),
-    "ORB-SLAM3": _peer_cpu,
+    "with the map, ours": _of(m.CPU, _with),
+    "CPU, ORB-SLAM3": _peer_cpu,
     "peak RSS (MiB), ours": _of(m.MEMORY, _without),
-    "ours, with the map": _of(m.MEMORY, _with),
+    "RSS with the map, ours": _of(m.MEMORY, _with),
     "RSS, ORB-SLAM3": _peer_number("peak_rss_mb"),
     "triangles, ours": _of(m.TRIANGLES, _with),
     "keyframes, ORB-SLAM3": _peer_number("keyframes"),
-    "points tracked in a frame, ORB-SLAM3": _peer_number("points"),
+    "points in a frame, ORB-SLAM3": _peer_number("points"),
 }
 _PAGE = """# Comparison with ORB-SLAM3
 
     {command}
 
-writes this page. Ours is commit {commits} with the weights `{weights}`. ORB-SLAM3 is the wheel pyorbslam3
-(`pip install pyorbslam3==0.1.1` in an environment of its own; it is under the GPL and no dependency of this project),
-monocular, with the thresholds of its own examples and as many corners. Its vocabulary: {vocabulary}. Each system
-ran **once** on each recording; ORB-SLAM3 is not the same twice, because its threads race. Its images came at
-{pace:g} times the speed of the recording, so that its mapping was not late on a busy machine. They were decoded and
-undistorted beforehand, which its times leave out.
+writes this page. Ours is commit {commits} with the weights `{weights}`. ORB-SLAM3 is the
+wheel pyorbslam3 0.1.1, monocular, with the thresholds of its own examples and as many corners. It runs in an
+environment of its own; it is under the GPL and no dependency of this project. Its vocabulary: {vocabulary}.
+
+- Ours ran **once** on each recording: a seed gives the same bytes. Every row is a run of ORB-SLAM3, which is not the
+  same twice, because its threads race.
+- The images of ORB-SLAM3 came at {pace:g} times the speed of the recording, so that its mapping was not late on a busy
+  machine. They were decoded and undistorted beforehand, which its times leave out.
 
 ## Accuracy
 
-ATE RMSE in metres after 7-dof alignment. *Both's frames* are those that both systems give a pose. Ours gives every
-frame one; ORB-SLAM3 has none before its map begins, or where it is lost. *6-dof* fits no scale: there our lengths are
-metres by the height of the camera alone. A monocular ORB-SLAM3 has no metric scale. 0 poses: it began no map.
+ATE RMSE in metres, after 7-dof alignment, over the frames that both systems give a pose. Ours gives every frame one;
+ORB-SLAM3 has none before its map begins, or where it is lost. *6-dof* fits no scale: our lengths are metres there, by
+the height of the camera alone. A monocular ORB-SLAM3 has no metric scale. 0 poses: it began no map.
 
 {accuracy}
 
 ## Cost
 
-Processor time is that of the process, without its start (for ORB-SLAM3, without reading the vocabulary); memory is the
-peak of the whole process. Our map is a surface. ORB-SLAM3's is a cloud of points, which the wheel does not hand out:
-the table has its keyframes and the median number of points that a frame tracks.
+Processor time is that of the process, without its start (for ORB-SLAM3, without reading the vocabulary). Memory is the
+peak of the whole process. For ORB-SLAM3 both are of the first run. Our map is a surface. That of ORB-SLAM3 is a cloud
+of points, which the wheel does not hand out: the table has its keyframes, and the median number of points that a frame
+tracks.
 
 {cost}
 """
@@ -286,7 +292,7 @@ def _command(options: argparse.Namespace) -> str:
     only = " --only " + " ".join(f"'{name}'" for name in options.only) if options.only else ""
     return (
         f"python tools/compare.py --data DATA --orb-python ORB_ENV/bin/python --vocabulary {options.vocabulary.name} "
-        f"--weights {options.weights} --pace {options.pace:g}{only}"
+        f"--weights {options.weights} --runs {options.runs} --pace {options.pace:g}{only}"
     )
 
 
@@ -299,6 +305,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--about-vocabulary", metavar="TEXT", help="where it comes from, for the page")
     add("--only", nargs="+", choices=[each.name for each in RECORDINGS], metavar="NAME", help="these recordings")
     add("--weights", default="sim", help="of our system (default: sim, which saw no real image)")
+    add("--runs", type=int, default=1, help="of ORB-SLAM3 on each recording; ours runs once")
     add("--pace", type=float, default=0.5, help="speed of ORB-SLAM3's images over the recording's; 0: no waiting")
     add("--output", type=Path, default=Path("runs/comparison"), metavar="FOLDER", help="keeps the runs")
     add("--report", type=Path, default=Path("docs/comparison.md"), help="the page")

@@ -25,7 +25,7 @@ import cv2
 from benchmarking import metrics as m
 from benchmarking.page import notes
 from benchmarking.plan import QUIET, WHOLE, BenchmarkSequence, Configuration, plan, slug
-from benchmarking.work import JobResult, job_result, perform
+from benchmarking.work import JobResult, job_result, perform, revision
 from shared.command import markdown, one_line_errors, parser_of
 
 from slam.commands.batch.execution import why_ended
@@ -107,7 +107,7 @@ def main(words: Sequence[str] | None = None) -> None:
     for each in there:
         pairs += _pairs(each, data, options)
         print(f"{len(pairs) // options.runs} of {len(there)} recordings: {each.name}", file=sys.stderr)
-    text = page(pairs, _command(options), options.about_vocabulary or options.vocabulary.name, options.pace)
+    text = page(pairs, _command(options), revision(), options.remarks)
     write_atomically(options.report, lambda file: file.write_text(text, encoding="utf-8"))
     print(text)
 
@@ -167,7 +167,7 @@ def _write_recording(drive: BenchmarkSequence, features: int, folder: Path) -> N
     (folder / "recording.json").write_text(json.dumps(recording))
 
 
-def page(pairs: Sequence[Pair], command: str, vocabulary: str, pace: float) -> str:
+def page(pairs: Sequence[Pair], command: str, commit: str, remarks: Sequence[str] = ()) -> str:
     """The page of all recordings."""
     accuracy = markdown(list(_ACCURACY), [[cell(pair) for cell in _ACCURACY.values()] for pair in pairs], numbers=8)
     first = list({pair.name: pair for pair in reversed(pairs)}.values())[::-1]
@@ -176,10 +176,9 @@ def page(pairs: Sequence[Pair], command: str, vocabulary: str, pace: float) -> s
     without, with_map = [p.without_map for p in first], [p.with_map for p in first]
     return _PAGE.format(
         command=command,
-        commits=", ".join(dict.fromkeys(o.commit or "unknown" for o in (*without, *with_map))),
+        commit=commit or "unknown",
         weights=with_map[0].job.weights,
-        vocabulary=vocabulary,
-        pace=pace,
+        remarks="".join(f"\n- {remark}" for remark in remarks),
         accuracy=accuracy + notes(without, (m.LENGTH,)),
         cost=cost + notes([o for o in with_map if not o.reason], (m.TRIANGLES,)) + failed,
     )
@@ -260,14 +259,15 @@ _PAGE = """# Comparison with ORB-SLAM3
 
     {command}
 
-writes this page. Ours is commit {commits} with the weights `{weights}`. ORB-SLAM3 is the
-wheel pyorbslam3 0.1.1, monocular, with the thresholds of its own examples and as many corners. It runs in an
-environment of its own; it is under the GPL and no dependency of this project. Its vocabulary: {vocabulary}.
+writes this page. Ours is commit {commit} with the weights `{weights}`. ORB-SLAM3 is the wheel pyorbslam3 0.1.1,
+monocular, with the thresholds of its own examples and as many corners. It runs in an environment of its own; it is
+under the GPL and no dependency of this project.
 
 - Ours ran **once** on each recording: a seed gives the same bytes. Every row is a run of ORB-SLAM3, which is not the
   same twice, because its threads race.
-- The images of ORB-SLAM3 came at {pace:g} times the speed of the recording, so that its mapping was not late on a busy
-  machine. They were decoded and undistorted beforehand, which its times leave out.
+- ORB-SLAM3 drops keyframes while its mapping is late. `--pace` is the speed of its images over that of the recording:
+  a slow one gives its mapping time on a busy machine. The mapping then does more, and its processor time grows.
+- Its images were decoded and undistorted beforehand, which its times leave out.{remarks}
 
 ## Accuracy
 
@@ -302,11 +302,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--data", type=Path, default=data and Path(data), metavar="FOLDER", help="recordings; default: $ERFSFM_DATA")
     add("--orb-python", type=Path, required=True, metavar="FILE", help="Python of an environment with pyorbslam3")
     add("--vocabulary", type=Path, required=True, metavar="FILE", help="of ORB descriptors, text")
-    add("--about-vocabulary", metavar="TEXT", help="where it comes from, for the page")
+    add("--remarks", nargs="+", default=(), metavar="TEXT", help="for the page, such as where the vocabulary is from")
     add("--only", nargs="+", choices=[each.name for each in RECORDINGS], metavar="NAME", help="these recordings")
     add("--weights", default="sim", help="of our system (default: sim, which saw no real image)")
     add("--runs", type=int, default=1, help="of ORB-SLAM3 on each recording; ours runs once")
-    add("--pace", type=float, default=0.5, help="speed of ORB-SLAM3's images over the recording's; 0: no waiting")
+    add("--pace", type=float, default=0.15, help="speed of ORB-SLAM3's images over the recording's; 0: no waiting")
     add("--output", type=Path, default=Path("runs/comparison"), metavar="FOLDER", help="keeps the runs")
     add("--report", type=Path, default=Path("docs/comparison.md"), help="the page")
     return parser

@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import cv2
@@ -178,10 +179,14 @@ def page(pairs: Sequence[Pair], command: str, commit: str, remarks: Sequence[str
         command=command,
         commit=commit or "unknown",
         weights=with_map[0].job.weights,
-        remarks="".join(f"\n- {remark}" for remark in remarks),
+        remarks="".join(f"\n- {_wrapped(remark)}" for remark in remarks),
         accuracy=accuracy + notes(without, (m.LENGTH,)),
         cost=cost + notes([o for o in with_map if not o.reason], (m.TRIANGLES,)) + failed,
     )
+
+
+def _wrapped(text: str) -> str:
+    return fill(text, 118, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def _ate(estimate: Trajectory | None, reference: Trajectory | None, among: Trajectory | None = None) -> str:

@@ -24,7 +24,9 @@ class NetworkConfig(Section):
 
     depth: str = Field(default="depthnet", description="preset of the depth network, see erfsfm networks")
     pose: str = Field(default="posenet", description="preset of the pose network, see erfsfm networks")
-    fidelity: Fidelity = Field(default="default", description="paper: the layers of the reference code, exactly")
+    fidelity: Fidelity = Field(
+        default="default", description="paper: layers, intrinsics and photometric error of the reference code"
+    )
     depth_width: float = Field(default=1.0, gt=0, le=4, description="factor on the depth network's channels")
     pose_width: float = Field(default=1.0, gt=0, le=4, description="factor on the pose network's channels")
     normalisation: Literal["none", "batch"] = Field(

@@ -175,6 +175,8 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
             mask = prediction.masks[level] if prediction.masks is not None else None
             photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
             finest = warped.reshape(batch.sources.shape) if level == 0 else finest
+    if config.network.fidelity == "paper":
+        photometric = 2 * photometric  # the reference compares images in [-1, 1]
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if prediction.masks is not None and loss.mask_weight > 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -94,7 +95,9 @@ def evaluate_objective(
         config: its ``loss``, ``network`` and ``teacher`` sections are used.
     """
     prediction = _Prediction.of(depth_net, pose_net, batch, config)
-    with torch.autocast(batch.target.device.type, enabled=False):
+    device = batch.target.device.type
+    has_autocast = torch.amp.is_autocast_available(device)  # `meta` has none
+    with torch.autocast(device, enabled=False) if has_autocast else nullcontext():
         return _evaluate(prediction, batch, config)
 
 

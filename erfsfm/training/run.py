@@ -41,8 +41,9 @@ from erfsfm.networks.transfer import take_over
 from erfsfm.training.keeper import Patience, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
-from erfsfm.training.output_folder import OutputFolder
+from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
 from erfsfm.training.progress import StepProgress
+from erfsfm.training.reach import without_gradient
 from erfsfm.training.supervision import measured_views
 
 logger = logging.getLogger(__name__)
@@ -158,9 +159,9 @@ def _draws(
         raise ConfigError("data.exact needs worlds as files, not in shards: set data.exact=0, or name the worlds")
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
-    folder = config.teacher.cache or output / "teacher"
+    folder = config.teacher.cache or output / MEASUREMENTS
     _, measured = by_label(training, config.data)
-    many_views = measured_views(measured, config, folder, progress if rank == 0 else silent)
+    many_views = measured_views(measured, config, folder, progress)
     return SnippetDraws(training, config, draws, done, rank, many_views)
 
 
@@ -272,8 +273,7 @@ def _trainer(
         accelerator="cpu" if on_cpu else "gpu",
         devices=training.devices,
         num_nodes=training.nodes,
-        # loss terms and scales that are off leave weights without gradient
-        strategy=DDPStrategy(find_unused_parameters=True) if several else "auto",
+        strategy=DDPStrategy(find_unused_parameters=bool(without_gradient(config))) if several else "auto",
         sync_batchnorm=several and not on_cpu,
         use_distributed_sampler=False,  # each process has its own draws, and all validate everything
         precision=precision,

@@ -622,6 +622,15 @@ def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path) -> None:
         train(config, tmp_path / "run", device="cpu")
 
 
+def test_a_start_that_was_interrupted_while_the_teacher_measured_goes_on(
+    alone: Configure, world: Path, tmp_path: Path
+) -> None:
+    teacher = poses_measured(world, tmp_path)
+    shutil.move(teacher.pop("cache"), tmp_path / "run" / "teacher")
+    config = alone(training={"networks": "pose", "steps": 1}, teacher=teacher)
+    assert load_model(train(config, tmp_path / "run", device="cpu")).record.step == 1
+
+
 def test_a_failed_start_leaves_nothing(alone: Configure, tmp_path: Path) -> None:
     config = alone().model_copy(update={"initial_weights": "nowhere"})
     with pytest.raises(CheckpointError):

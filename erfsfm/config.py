@@ -220,6 +220,12 @@ class TrainingConfig(Section):
     schedule: Literal["constant", "cosine", "step"] = Field(
         default="constant", description="of the learning rate; step: divided by ten in the last quarter"
     )
+    average_decay: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="of the moving average of the weights at every step, which is validated and written; 0: none",
+    )
     gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
     validate_every: int = Field(default=1000, ge=1, description="steps between validations")
     patience: int = Field(

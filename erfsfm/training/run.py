@@ -38,7 +38,7 @@ from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
-from erfsfm.training.keeper import Patience, WeightKeeper
+from erfsfm.training.keeper import Average, Patience, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
@@ -95,11 +95,13 @@ def train(
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before])
-    keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks)
+    decay = config.training.average_decay
+    average = Average(decay, choose_device(device)) if decay > 0 else None
+    keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks, average)
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
     loader = _loader(draws, config, device)
-    trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
+    trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress), average), done_steps)
     if config.training.nodes > 1:
         logger.warning("training begins when this command runs on all %d machines", config.training.nodes)
     with raising_on_termination(), FolderLock() as lock:
@@ -244,7 +246,7 @@ def _trainer(
     config: ExperimentConfig,
     output: Path,
     device: str,
-    callbacks: tuple[WeightKeeper, Timer, StepProgress],
+    callbacks: tuple[WeightKeeper, Timer, StepProgress, Average | None],
     done_steps: int,
 ) -> lightning.Trainer:
     training = config.training
@@ -268,6 +270,7 @@ def _trainer(
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
     stops = [Patience(training.patience)] if training.patience else []
+    others = [each for each in callbacks if each is not None]
     several = training.processes > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
@@ -284,7 +287,7 @@ def _trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, *callbacks, *stops],
+        callbacks=[latest, *stops, *others],
         plugins=[AtomicCheckpoints()],
         enable_progress_bar=False,
         enable_model_summary=False,

@@ -179,11 +179,11 @@ def test_two_runs_are_equal(alone: Configure, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "schedule, normalisation, optimiser",
+    "schedule, normalisation, optimiser, average_decay",
     [
-        ("constant", "none", "adam"),
-        ("cosine", "batch", "adam"),
-        pytest.param("cosine", "batch", "muon", marks=pytest.mark.slow),
+        ("constant", "none", "adam", 0),
+        ("cosine", "batch", "adam", 0.8),
+        pytest.param("cosine", "batch", "muon", 0, marks=pytest.mark.slow),
     ],
 )
 def test_resume_ends_with_identical_weights(
@@ -194,10 +194,12 @@ def test_resume_ends_with_identical_weights(
     schedule: str,
     normalisation: str,
     optimiser: str,
+    average_decay: float,
 ) -> None:
     """Interrupted at step 5 of 6; the last checkpoint is of step 4, where there also was a validation."""
     small["network"]["normalisation"] = normalisation
     training = {"steps": 6, "schedule": schedule, "learning_rate": 1e-3, "gradient_clip": 1.0, "optimiser": optimiser}
+    training |= {"average_decay": average_decay}
     config = both(training=training)
     train(config, tmp_path / "whole", device="cpu")
     interrupted(monkeypatch, config, tmp_path / "cut", 5)
@@ -218,6 +220,24 @@ def test_resume_ends_with_identical_weights(
     assert records[0].step == records[1].step == 6
     assert (tmp_path / "cut" / "logs" / "csv" / "metrics.csv").is_file(), "the log before the interruption stays"
     assert (tmp_path / "cut" / "logs" / "csv_from_4" / "metrics.csv").is_file()
+
+
+def test_the_average_of_the_weights_is_what_is_measured_and_written(
+    both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def steps_of(name: str, **training: Any) -> Path:
+        return train(both(training={"validate_every": 1, **training}), tmp_path / name, device="cpu") / "last"
+
+    first, second, third = (weights_of(steps_of(str(steps), steps=steps)) for steps in (1, 2, 3))
+    expected = [a / 4 + b / 4 + c / 2 for a, b, c in zip(first, second, third, strict=True)]
+    averaged = steps_of("averaged", steps=3, average_decay=0.5)
+    torch.testing.assert_close(weights_of(averaged), expected)
+    still = both(training={"steps": 1, "learning_rate": 1e-12}).model_copy(update={"initial_weights": str(averaged)})
+    again = load_model(train(still, tmp_path / "still", device="cpu")).record.metrics
+    assert load_model(averaged).record.metrics == pytest.approx(again, rel=1e-4)
+    config = both(training={"steps": 5, "validate_every": 4, "average_decay": 0.5})
+    interrupted(monkeypatch, config, tmp_path / "cut", 3)
+    torch.testing.assert_close(weights_of(tmp_path / "cut" / "last"), expected)
 
 
 @pytest.mark.parametrize("moment", ["in a step", "in the second checkpoint"])

@@ -16,11 +16,7 @@ evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of 
 @evaluate_app.command("depth")
 def evaluate_depth(
     dataset: Annotated[
-        list[Path],
-        typer.Option(
-            help="a root with true depth (erfsfm-slam simulate --depth), KITTI raw, or a folder of images/ and truth/; "
-            "repeat for more streets"
-        ),
+        list[Path], typer.Option(help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat")
     ],
     weights: Weights = "default",
     truth: Annotated[
@@ -50,11 +46,8 @@ def evaluate_depth(
     many-views no true depth is needed: static surfaces are measured from their neighbouring frames.
 
     Example: erfsfm evaluate depth --weights sim --dataset worlds --dataset KITTI_RAW --output depth.json
-
-    Example: erfsfm evaluate depth --weights sim --dataset KITTI_RAW --split eigen --fidelity paper
     """
     from erfsfm.common.errors import ConfigError
-    from erfsfm.common.files import write_atomically
     from erfsfm.common.progress import progress_bar
     from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.evaluation.many_view_truth import many_view_protocol
@@ -73,18 +66,26 @@ def evaluate_depth(
     with progress_bar() as show:
         if truth == "many-views":
             rows = many_view_protocol(predictor, dataset[0], sequence or (), cache, allow_leak, show)
-        elif split is not None:
-            rows = eigen_protocol(predictor, dataset[0], split, fidelity, allow_leak)
-        else:
+        elif split is None:
             rows = depth_protocol(predictor, dataset, allow_leak, show)
+        else:
+            rows = eigen_protocol(predictor, dataset[0], split, fidelity, allow_leak)
+    _show(rows, output, as_json)
+
+
+def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
+    """Write the rows, if a file is named, and print them."""
+    from erfsfm.common.files import write_atomically
+
     if output is not None:
         write_atomically(output, lambda path: path.write_text(json.dumps(rows, indent=2) + "\n"))
-    of_streets = truth == "measured" and split is None and not as_json
-    print_rows([_narrow(row) for row in rows] if of_streets else rows, as_json)
+    print_rows(rows if as_json else [_narrow(row) for row in rows], as_json)
 
 
 def _narrow(row: dict[str, Any]) -> dict[str, Any]:
-    """What of a street's row fits into a table of 80 columns."""
+    """What of a street's row fits into a table of 80 columns; another row as it is."""
+    if "abs_rel_se" not in row:
+        return row
     shown = {"method": row.get("street", row["method"]), "abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
     return shown | {key: row[key] for key in ("rmse", "a1", "images", "leak")}
 

@@ -61,7 +61,7 @@ class WeightKeeper(Callback):
         average: Average | None = None,
     ) -> None:
         self._output = output
-        self._average = average
+        self.average = average
         self._seen = seen
         self._command = command
         self.validates = validates
@@ -89,8 +89,8 @@ class WeightKeeper(Callback):
     ) -> None:
         """Keep the weights so far, if they are finite."""
         assert isinstance(module, SelfSupervision)
-        if self._average is not None:
-            self._average.end_early(trainer, module)
+        if self.average is not None:
+            self.average.end_early(trainer, module)
         if trainer.is_global_zero and trainer.global_step > 0 and _all_finite(module):
             save_model(self._output / "last", self._model(module, trainer.global_step))
 

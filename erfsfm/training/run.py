@@ -95,13 +95,11 @@ def train(
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before])
-    decay = config.training.average_decay
-    average = Average(decay, choose_device(device)) if decay > 0 else None
-    keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks, average)
+    keeper = _keeper(config.training, output, seen, command, bool(validation), device)
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
     loader = _loader(draws, config, device)
-    trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress), average), done_steps)
+    trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     if config.training.nodes > 1:
         logger.warning("training begins when this command runs on all %d machines", config.training.nodes)
     with raising_on_termination(), FolderLock() as lock:
@@ -143,6 +141,14 @@ def _require_devices(wanted: int, device: str) -> None:
 def _timer(minutes: float) -> Timer:
     """Time of the loop, kept in checkpoints; it ends the run after some minutes, if any are given."""
     return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
+
+
+def _keeper(
+    training: TrainingConfig, output: Path, seen: list[str], command: str, validates: bool, device: str
+) -> WeightKeeper:
+    decay = training.average_decay
+    average = Average(decay, choose_device(device)) if decay > 0 else None
+    return WeightKeeper(output, seen, command, validates, training.networks, average)
 
 
 def _draws(
@@ -246,7 +252,7 @@ def _trainer(
     config: ExperimentConfig,
     output: Path,
     device: str,
-    callbacks: tuple[WeightKeeper, Timer, StepProgress, Average | None],
+    callbacks: tuple[WeightKeeper, Timer, StepProgress],
     done_steps: int,
 ) -> lightning.Trainer:
     training = config.training
@@ -270,7 +276,7 @@ def _trainer(
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
     stops = [Patience(training.patience)] if training.patience else []
-    others = [each for each in callbacks if each is not None]
+    average = [callbacks[0].average] if callbacks[0].average else []
     several = training.processes > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
@@ -287,7 +293,7 @@ def _trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, *stops, *others],
+        callbacks=[latest, *callbacks, *stops, *average],
         plugins=[AtomicCheckpoints()],
         enable_progress_bar=False,
         enable_model_summary=False,

@@ -99,12 +99,12 @@ class SelfSupervision(lightning.LightningModule):
         return result.total
 
     def on_after_backward(self) -> None:
-        """Read loss and spread of the depth, the only time in a step that waits for the device.
+        """Read loss and spread of the depth, means over all processes, in one wait for the device.
 
         Raises:
             TrainingError: the loss is not finite, or the depth has been constant for many steps.
         """
-        self.loss, spread = self._watched.tolist()
+        self.loss, spread = self.trainer.strategy.reduce(self._watched, reduce_op="mean").tolist()
         if not math.isfinite(self.loss):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in self._terms.items())
             raise TrainingError(

@@ -843,7 +843,7 @@ def test_two_processes_are_one_with_twice_the_batch(
     """Batches of 2 in each of two processes; of 4 in one."""
 
     def run(name: str, resume: bool = False, **training: Any) -> None:
-        config = both(training=training, data={"workers": workers})
+        config = both(training={"average_decay": 0.5} | training, data={"workers": workers})
         in_processes(config, tmp_path / name, resume)
 
     run("one", batch=4)
@@ -871,3 +871,34 @@ def test_two_processes_stop_together_though_they_measure_different_things(
     in_processes(both(training=training), tmp_path / "run", before=measured)
     assert load_model(tmp_path / "run" / "last").record.step == 3
     assert load_model(tmp_path / "run").record.metrics == {"abs_rel": 0.2}
+
+
+@pytest.mark.slow
+def test_two_processes_end_together_by_a_loss_of_one_that_is_not_finite(
+    both: Configure, tmp_path: Path, in_processes: Callable[..., None]
+) -> None:
+    spoiled = """
+import os
+from erfsfm.common.errors import TrainingError
+
+step, run = SelfSupervision.training_step, train
+
+def poisoned(self, batch, index):
+    if self.global_rank == self.global_step == 1:
+        batch["target"] *= float("nan")
+    return step(self, batch, index)
+
+def train(*arguments, **named):
+    try:
+        run(*arguments, **named)
+    except TrainingError as error:
+        assert "the loss at step 1 is not finite" in str(error), error
+    else:
+        raise AssertionError("trained on")
+    if os.environ["NODE_RANK"] == "1":
+        sys.exit()
+
+SelfSupervision.training_step = poisoned
+"""
+    in_processes(both(training={"steps": 6, "nodes": 2}), tmp_path / "run", before=spoiled)
+    assert load_model(tmp_path / "run" / "last").record.step == 1

@@ -63,7 +63,7 @@ def test_what_is_packed_is_the_mesh(plain: Ply) -> None:
 @pytest.fixture
 def report(make_run: MakeRun, map_views: MapViews) -> Path:
     folder = make_run()
-    write_report(folder, [], map_views)
+    write_report(folder, views=map_views)
     return folder.path / "report.html"
 
 

@@ -16,8 +16,9 @@ from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config.sections import SlamConfig, dump_yaml
 from slam.evaluation.double_walls import double_wall_share
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame
+from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
+from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.submap import remove_submaps
 from slam.mapping.surface import positions
@@ -35,6 +36,7 @@ from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import write_map_views
 from slam.results.report.page import write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.report.rendering import Picture
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
 from slam.runtime.errors import EmptyMapError, RunError, SlamError
@@ -135,10 +137,23 @@ def _run(job: Job, folder: RunFolder) -> None:
     job.progress("report", 0, 1)
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
-        write_report(folder, depths.pictures(), loop_pictures(result, job.recording, job.settings.loops), views)
+        write_report(folder, depths.pictures(), _loop_pictures(result, job), views)
     job.progress("report", 1, 1)
     if job.rerun is not None:
         write_rerun(job.rerun, result, job.recording.intrinsics)
+
+
+def _loop_pictures(result: Estimate, job: Job) -> list[Picture]:
+    """Images of accepted loops: of the recording, or of the keyframes of a live drive."""
+
+    def image(index: int) -> Image | None:
+        try:
+            return job.recording.frame(index).image
+        except SlamError:
+            return next((each.image for each in result.drive.keyframes if each.index == index), None)
+
+    thresholds = OF_KEYFRAMES if result.drive.maps else LoopThresholds.of_frames(job.settings.loops)
+    return loop_pictures(result.loops.accepted, image, job.recording.intrinsics, thresholds)
 
 
 def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import LoopsConfig
 from slam.frames import DepthMap, Image, Intrinsics, View
-from slam.frames import Sequence as FrameSequence
 from slam.geometry.se3 import FloatArray
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
+from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, matches
 from slam.mapping.filters import KeyframeDepth
-from slam.pipeline.estimate import Estimate
 from slam.results.report.rendering import Picture
-from slam.runtime.errors import SlamError
 
 _EXAMPLES, _MOST_LOOPS, _MOST_LINES = 5, 6, 60
 _WIDTH_PX = 480
@@ -52,28 +48,26 @@ class DepthPictures:
         return found
 
 
-def loop_pictures(result: Estimate, recording: FrameSequence, config: LoopsConfig) -> list[Picture]:
-    """Accepted loops, spread over the drive: both images with the corners that match under the measured motion.
+def loop_pictures(
+    loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics, thresholds: LoopThresholds
+) -> list[Picture]:
+    """Some loops, spread over the drive: both images with the corners that match under the measured motion.
 
-    Loops whose images are gone, as those of a live drive without keyframes, are left out.
+    Args:
+        loops: accepted ones.
+        image: of a frame; None where it is gone, as those of a live drive are. Such loops are left out.
+        intrinsics: of the recording; images may be smaller.
+        thresholds: of matches.
     """
-    found, accepted = [], sorted(result.loops.accepted, key=lambda loop: loop.ends[::-1])
-    for some in np.array_split(np.arange(len(accepted)), min(_MOST_LOOPS, len(accepted)) or 1):
-        if len(some) == 0:
-            continue
-        loop = max((accepted[k] for k in some), key=lambda loop: loop.inliers)
-        images = [_image(index, result, recording) for index in loop.ends]
-        if images[0] is not None and images[1] is not None:
-            thresholds = OF_KEYFRAMES if result.drive.maps else LoopThresholds.of_frames(config)
-            found.append(_pair(loop, images[0], images[1], recording.intrinsics, thresholds))
+    found = []
+    ordered = sorted(loops, key=lambda loop: loop.ends[::-1])
+    for some in np.array_split(np.arange(len(ordered)), min(_MOST_LOOPS, len(ordered)) or 1):
+        best = max((ordered[k] for k in some), key=lambda loop: loop.inliers, default=None)
+        if best is not None:
+            first, second = (image(index) for index in best.ends)
+            if first is not None and second is not None:
+                found.append(_pair(best, first, second, intrinsics, thresholds))
     return found
-
-
-def _image(index: int, result: Estimate, recording: FrameSequence) -> Image | None:
-    try:
-        return recording.frame(index).image
-    except SlamError:
-        return next((keyframe.image for keyframe in result.drive.keyframes if keyframe.index == index), None)
 
 
 def _pair(loop: Loop, first: Image, second: Image, intrinsics: Intrinsics, thresholds: LoopThresholds) -> Picture:

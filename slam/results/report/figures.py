@@ -205,7 +205,7 @@ def _frames(trajectory: Trajectory, among: Mapping[str, Trajectory]) -> Any:
 
 
 def _from_above(figure: go.Figure, unit: str) -> go.Figure:
-    figure.update_xaxes(title=f"x, right ({unit})", constrain="domain")
+    figure.update_xaxes(title=f"x, right ({unit})")
     figure.update_yaxes(title=f"z, ahead ({unit})", scaleanchor="x")
     return figure.update_layout(height=_MAP, hovermode="closest", dragmode="pan")
 

@@ -41,9 +41,11 @@ async function runPacked(element) {
         modeBarButtons: [["zoom2d", "pan2d", "resetScale2d", "toImage"]],
       });
     }
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-      for (const plot of plots) Plotly.relayout(plot, { template: template() });
-    });
+    const redraw = size => plots.forEach(plot => Plotly.relayout(plot, { template: template(), ...size }));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => redraw({}));
+    const paper = document.documentElement.classList;
+    addEventListener("beforeprint", () => { paper.add("paper"); redraw({ width: 680 }); });
+    addEventListener("afterprint", () => { paper.remove("paper"); redraw({ width: null, autosize: true }); });
   } catch (error) {
     for (const plot of plots) plot.textContent = `The plot cannot be drawn here: ${error.message}.`;
   }

@@ -34,14 +34,15 @@ def trajectories_figure(
     loops: Sequence[AcceptedLoop] = (),
     view: AerialView | None = None,
 ) -> go.Figure:
-    """Trajectories from above, over the map where there is a view of it.
+    """Trajectories from above: as written over the map where there is a view of it, else `aligned`.
 
     Args:
-        trajectories: by name, in one world.
+        trajectories: by name.
         unit: of their positions.
         loops: accepted ones, whose places are marked on the optimised trajectory.
         view: the map, in the world of the optimised trajectory.
     """
+    trajectories = aligned(trajectories) if view is None else trajectories
     figure = go.Figure()
     for name, trajectory in trajectories.items():
         where = f"x %{{x:.2f}}, z %{{y:.2f}} {unit}"

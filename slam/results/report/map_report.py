@@ -84,11 +84,6 @@ def map_errors_table(metrics: Metrics) -> Table | None:
     if not isinstance(found.in_field.share, Missing) and found.in_field.share != 1.0:
         rows.append(_row("where the scanner looked", found.in_field))
     rows.append(_row("with one scale", found.with_scale))
-    rings = _rings(metrics)
-    if rings:
-        is_rigid = not isinstance(found.by_distance, Missing)
-        rows.append("By distance from the nearest camera" + ("" if is_rigid else ", with one scale"))
-        rows += [_row(f"{known(ring.from_m):.0f} to {known(ring.to_m):.0f} m", ring) for ring in rings]
     length = number(found.evaluated_m).text
     truth = _TRUTHS.get(found.truth, found.truth)
     words = f"Against {truth}, {length} m of road. Map where no surface was measured is an error."

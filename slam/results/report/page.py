@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from slam.evaluation.drift import aligned
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
@@ -26,6 +25,13 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 logger = logging.getLogger(__name__)
+
+_ALIGNED = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
+_AS_WRITTEN = "As written; no ground truth is known. The raw network chain is scaled to the rest."
+_NOISE = (
+    "Share of factors whose error at the truth lies inside a bound of their stated noise; dashed is what the bound "
+    "promises. Less means sigmas that are too small, more means sigmas that are too large."
+)
 
 
 def write_report(
@@ -46,7 +52,6 @@ def write_report(
         RunError: ``metrics.json`` is damaged.
     """
     metrics, loops_file = folder.metrics(), _loops_file(folder)
-    trajectories, unit = _trajectories(folder), length_unit(folder)
     page = render(
         "page.html.j2",
         name=known(metrics.sequence.name) or folder.path.resolve().name,
@@ -57,27 +62,23 @@ def write_report(
         unit_notes=metrics.unit_notes(),
         key_numbers=[] if metrics.failure else report_tables.key_numbers(metrics),
         what_ran=report_tables.what_ran(metrics),
-        trajectories=list(_trajectory_plots(metrics, trajectories, unit, loops_file)),
+        plots=_plots(metrics, _trajectories(folder), length_unit(folder), loops_file, views),
         errors=report_tables.errors(metrics),
         gps=report_tables.gps(metrics),
         no_errors=report_tables.no_errors(metrics),
-        error_pictures=list(_error_plots(trajectories)),
         depths=depths,
         depth_error=_depth_error(metrics),
-        map_picture=_map_picture(views, trajectories, unit),
         driver=_driver_picture(views),
         viewer=None if views is None else views.viewer,
         map=map_sizes(metrics),
         map_filters=map_filters(metrics),
         map_errors=map_errors_table(metrics),
-        map_curve=_map_curve(metrics),
         no_map=_absence(metrics, metrics.map),
         loops=report_tables.loops(metrics, loops_file),
         loop_pictures=loops,
         no_loops=_absence(metrics, metrics.loops),
         tracking=report_tables.tracking(metrics),
         graph=report_tables.graph(metrics),
-        noise=_noise_plot(metrics),
         timing=report_tables.timing(metrics),
         alignments=report_tables.alignments(metrics),
         files=_files(folder),
@@ -100,51 +101,50 @@ def _absence(metrics: Metrics, part: object) -> str:
     return part.reason
 
 
-def _trajectory_plots(
-    metrics: Metrics, trajectories: Mapping[str, Trajectory], unit: str, loops: LoopsFile
-) -> Iterator[Picture]:
+def _plots(
+    metrics: Metrics, trajectories: Mapping[str, Trajectory], unit: str, loops: LoopsFile, views: MapViews | None
+) -> dict[str, list[Picture]]:
+    """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
     from slam.results.report import figures
 
-    if not trajectories:
-        return
-    gaps, accepted = known(metrics.sequence.bridged) or [], list(known(loops.accepted) or ())
-    title = "Trajectories from above"
-    if REFERENCE not in trajectories or len(trajectories) == 1:
-        caption = "As written; no ground truth is known. The raw network chain is scaled to the rest."
-        yield _drawn(lambda: figures.trajectories_figure(aligned(trajectories), unit, accepted), title, caption)
+    found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": [], "map errors": [], "noise": []}
+
+    def add(section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> None:
+        try:
+            found[section].append(Picture.of_plot(title, caption, draw(*given)))
+        except SlamError as error:
+            found[section].append(Picture(title, caption, reason=str(error)))
+
+    has_truth = REFERENCE in trajectories and len(trajectories) > 1
+    gaps, accepted = known(metrics.sequence.bridged) or [], known(loops.accepted) or []
+    if trajectories:
+        given = (trajectories, "m" if has_truth else unit, accepted)
+        caption = _ALIGNED if has_truth else _AS_WRITTEN
+        add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
+    if has_truth:
+        how = "as written, the network after the 7-dof alignment" if metrics.is_metric else "after the 7-dof alignment"
+        caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
+        title = "Scale and rotation over time"
+        add("trajectories", title, caption, figures.scale_figure, trajectories, metrics.is_metric, gaps)
+        caption = "Distance to the true position, after the 7-dof alignment."
+        add("errors", "Position error along the path", caption, figures.error_figure, trajectories)
+        caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
+        add("errors", "Drift by the length of segments", caption, figures.drift_figure, trajectories)
+    elif trajectories:
         caption = "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
-        yield _drawn(lambda: figures.motion_figure(trajectories, unit, gaps), "Speed and rotation over time", caption)
-        return
-    caption = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
-    yield _drawn(lambda: figures.trajectories_figure(aligned(trajectories), "m", accepted), title, caption)
-    how = "as written, the network after the 7-dof alignment" if metrics.is_metric else "after the 7-dof alignment"
-    caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
-    draw = lambda: figures.scale_figure(trajectories, metrics.is_metric, gaps)  # noqa: E731
-    yield _drawn(draw, "Scale and rotation over time", caption)
-
-
-def _error_plots(trajectories: Mapping[str, Trajectory]) -> Iterator[Picture]:
-    from slam.results.report import figures
-
-    if REFERENCE not in trajectories or len(trajectories) < 2:
-        return
-    caption = "Distance to the true position, after the 7-dof alignment."
-    yield _drawn(lambda: figures.error_figure(trajectories), "Position error along the path", caption)
-    caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
-    yield _drawn(lambda: figures.drift_figure(trajectories), "Drift by the length of segments", caption)
-
-
-def _noise_plot(metrics: Metrics) -> Picture | None:
-    from slam.results.report.figures import noise_figure
-
-    coverage, by_source = known(metrics.graph.coverage), known(metrics.graph.coverage_by_source) or {}
-    if coverage is None:
-        return None
-    caption = (
-        "Share of factors whose error at the truth lies inside a bound of their stated noise; dashed is what the bound "
-        "promises. Less means sigmas that are too small, more means sigmas that are too large."
-    )
-    return _drawn(lambda: noise_figure(coverage, by_source), "Stated noise", caption)
+        add("trajectories", "Speed and rotation over time", caption, figures.motion_figure, trajectories, unit, gaps)
+    if views is not None:
+        driven = {name: each for name, each in trajectories.items() if name == "optimised"}
+        caption = "The map from above in its own colours, with the optimised trajectory."
+        add("map", "Map from above", caption, figures.trajectories_figure, driven, unit, (), views.above)
+    if panels := map_curves(metrics):
+        caption = "Error of the map by the distance of its points, and of the true surface, from the nearest camera."
+        axis = "distance from the camera (m)"
+        add("map errors", "Map error over distance", caption, figures.curves_figure, axis, panels)
+    if (coverage := known(metrics.graph.coverage)) is not None:
+        by_source = known(metrics.graph.coverage_by_source) or {}
+        add("noise", "Stated noise", _NOISE, figures.noise_figure, coverage, by_source)
+    return found
 
 
 def _depth_error(metrics: Metrics) -> Table | None:
@@ -165,30 +165,11 @@ def _signed(value: float | Missing) -> Cell:
     return number(value) if isinstance(value, Missing) else Cell(f"{value:+.2f}")
 
 
-def _map_picture(views: MapViews | None, trajectories: Mapping[str, Trajectory], unit: str) -> Picture | None:
-    from slam.results.report.figures import trajectories_figure
-
-    if views is None:
-        return None
-    driven = {name: each for name, each in trajectories.items() if name == "optimised"}
-    caption = "The map from above in its own colours, with the optimised trajectory."
-    return _drawn(lambda: trajectories_figure(driven, unit, view=views.above), "Map from above", caption)
-
-
 def _driver_picture(views: MapViews | None) -> Picture | None:
     if views is None:
         return None
     caption = f"The map from the driver's seat at frame {views.frame}."
     return Picture.of_file("Map from the driver's seat", caption, views.driver, "png")
-
-
-def _map_curve(metrics: Metrics) -> Picture | None:
-    from slam.results.report.figures import curves_figure
-
-    if not (panels := map_curves(metrics)):
-        return None
-    caption = "Error of the map by the distance of its points, and of the true surface, from the nearest camera."
-    return _drawn(lambda: curves_figure("distance from the camera (m)", panels), "Map error over distance", caption)
 
 
 def _files(folder: RunFolder) -> Table | None:
@@ -208,14 +189,6 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
     except SlamError as error:
         logger.info("the report shows no trajectories: %s", error)
         return {}
-
-
-def _drawn(draw: Callable[[], Figure], title: str, caption: str) -> Picture:
-    """A plot, or why it cannot be drawn (for example, trajectories without common stamps)."""
-    try:
-        return Picture.of_plot(title, caption, draw())
-    except SlamError as error:
-        return Picture(title, caption, reason=str(error))
 
 
 def _size(count: int) -> str:

@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Image, Intrinsics, View
-from slam.geometry.se3 import FloatArray
+from slam.frames import Image, Intrinsics, View
+from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.frontend.visual.residuals import Residuals
+from slam.geometry.se3 import invert
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, matches
@@ -18,8 +20,7 @@ from slam.results.report.rendering import Picture
 
 _EXAMPLES, _MOST_LOOPS, _MOST_LINES = 5, 6, 60
 _WIDTH_PX = 480
-_UNKNOWN = (166, 160, 154)  # BGR
-_LINES = ((178, 114, 0), (0, 159, 230), (115, 158, 0), (167, 121, 204), (0, 94, 213))
+_LINES = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (213, 94, 0))
 
 
 class DepthPictures:
@@ -37,14 +38,15 @@ class DepthPictures:
             self._places = [place for place in self._places if place > keyframe.frame]
 
     def pictures(self) -> list[Picture]:
-        """A strip each: the image, learned depth and refined depth, near in yellow, one colour scale for all."""
-        limits = _limits([each.depth for each in self._kept])
+        """A strip each: the image, learned depth and refined depth, near in yellow, in one colour scale."""
+        from erfsfm.inference import colour_disparity
+
         found = []
         for each in self._kept:
             learned = each.depth if each.network_depth is None else each.network_depth
             depths = [learned] if each.relative_sigma is None else [learned, each.depth]
-            strip = [_bgr(each.image), *(_coloured(depth, limits) for depth in depths)]
-            found.append(_picture(np.hstack([_narrow(part) for part in strip]), f"Frame {each.frame}"))
+            strip = np.hstack([each.image, colour_disparity(np.hstack(depths))])
+            found.append(_picture(_narrow(strip, _WIDTH_PX * (1 + len(depths))), f"Frame {each.frame}"))
         return found
 
 
@@ -79,27 +81,20 @@ def _pair(loop: Loop, first: Image, second: Image, intrinsics: Intrinsics, thres
     (camera_first, view_first), (camera_second, view_second) = views
     rows_first, rows_second = matches(view_first, view_second, thresholds)
     from_, to = view_first.pixels[rows_first], view_second.pixels[rows_second]
-    off = _off_epipolar(loop.measured.T_from_to, camera_first.rays(from_), camera_second.rays(to))
-    kept = off * camera_first.fx < thresholds.reprojection_px
+    T_second_first = invert(loop.measured.T_from_to)
+    motion = UnitRelativePose(T_second_first[:3, :3], T_second_first[:3, 3])  # of any length
+    rays_first, rays_second = camera_first.rays(from_), camera_second.rays(to)
+    residuals = Residuals(rays_first, rays_second, np.full(len(from_), np.nan), camera_first.fx)
+    kept = np.abs(residuals.across(motion, np.eye(3, 2))[0]) < thresholds.reprojection_px
     drawn = np.flatnonzero(kept)[:: max(1, -(-int(kept.sum()) // _MOST_LINES))]
     title = f"Frames {loop.ends[0]} and {loop.ends[1]}: {loop.inliers} inliers"
     return _picture(_joined(first, second, from_[drawn], to[drawn]), title)
 
 
-def _off_epipolar(T_first_second: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Sampson distances ``(M,)`` of rays ``(M, 3)`` with z = 1 from their epipolar lines."""
-    x, y, z = T_first_second[:3, 3] / max(float(np.linalg.norm(T_first_second[:3, 3])), 1e-12)
-    E = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ T_first_second[:3, :3]
-    lines_first, lines_second = second @ E.T, first @ E
-    gradient = (lines_first[:, :2] ** 2).sum(axis=1) + (lines_second[:, :2] ** 2).sum(axis=1)
-    error: FloatArray = np.abs((first * lines_first).sum(axis=1)) / np.sqrt(np.maximum(gradient, 1e-12))
-    return error
-
-
 def _joined(first: Image, second: Image, from_: NDArray[np.float32], to: NDArray[np.float32]) -> Image:
     """Both images, wide ones below each other, with a line for every corner ``(M, 2)``."""
     wide = first.shape[1] > 2 * first.shape[0]
-    above, below = _narrow(_bgr(first)), _narrow(_bgr(second))
+    above, below = _narrow(first, _WIDTH_PX), _narrow(second, _WIDTH_PX)
     shift = np.array([0, above.shape[0]] if wide else [above.shape[1], 0])
     joined = np.ascontiguousarray(np.vstack([above, below]) if wide else np.hstack([above, below]))
     starts = np.rint(from_ * (above.shape[1] / first.shape[1])).astype(int)
@@ -112,39 +107,14 @@ def _joined(first: Image, second: Image, from_: NDArray[np.float32], to: NDArray
     return joined
 
 
-def _limits(depths: Sequence[DepthMap]) -> tuple[float, float]:
-    """Disparities between which colours change."""
-    known = [1.0 / depth[_is_known(depth)] for depth in depths]
-    seen = np.concatenate(known) if known else np.zeros(0)
-    low, high = np.percentile(seen, [2, 98]) if seen.size else (0.0, 1.0)
-    return float(low), max(float(high - low), 1e-9)
+def _narrow(image: Image, width: int) -> Image:
+    height = max(round(image.shape[0] * width / image.shape[1]), 1)
+    method = cv2.INTER_AREA if width < image.shape[1] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (width, height), interpolation=method), np.uint8)
 
 
-def _coloured(depth: DepthMap, limits: tuple[float, float]) -> Image:
-    """1 / depth in colours, BGR: near in yellow, far in black, grey where it is unknown."""
-    is_known = _is_known(depth)
-    share = (1.0 / np.where(is_known, depth, 1.0) - limits[0]) / limits[1]
-    coloured = cv2.applyColorMap(np.clip(255.0 * share, 0.0, 255.0).astype(np.uint8), cv2.COLORMAP_INFERNO)
-    return np.where(is_known[..., None], coloured, np.array(_UNKNOWN, np.uint8))
-
-
-def _is_known(depth: DepthMap) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(depth) & (depth > 0))
-
-
-def _narrow(image: Image) -> Image:
-    height, width = image.shape[:2]
-    size = (_WIDTH_PX, max(round(height * _WIDTH_PX / width), 1))
-    method = cv2.INTER_AREA if width > _WIDTH_PX else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size, interpolation=method), np.uint8)
-
-
-def _bgr(image: Image) -> Image:
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), np.uint8)
-
-
-def _picture(bgr: Image, title: str) -> Picture:
-    written, content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 82])
+def _picture(image: Image, title: str) -> Picture:
+    written, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
     if not written:
         return Picture(title, title, reason="it cannot be written as JPEG")
     return Picture.of_file(title, title, content.tobytes(), "jpeg")

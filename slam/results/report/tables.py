@@ -21,7 +21,7 @@ from slam.results.error_columns import (
     Errors,
     written,
 )
-from slam.results.metrics import CAMERA_HEIGHTS, METRES, AgreementMetrics, GpsErrors, LoopsFile, Metrics, Stretch
+from slam.results.metrics import CAMERA_HEIGHTS, METRES, GpsErrors, LoopsFile, Metrics, Stretch
 from slam.runtime.run_files import LOOPS, METRICS, TRAJECTORIES
 from slam.runtime.storage.record import NOT_RECORDED, Missing, known
 
@@ -100,7 +100,6 @@ def what_ran(metrics: Metrics) -> Table:
         ("True length", text(sequence.length_m, unit=" m")),
         ("Frame rate", text(sequence.fps, unit=" frames/s")),
         ("Scale", _scale(metrics)),
-        *((f"{each.source} beside the images", _agreement(each)) for each in known(metrics.agreement) or ()),
         ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
         ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
         ("Noise of the poses", noise if DASH in noise else f"noise.yaml, sha256 {noise}"),
@@ -125,10 +124,6 @@ def _scale(metrics: Metrics) -> str:
     certain = "" if spread is None else f", spread {100 * spread:.1f} %"
     used = "" if frames is None else f", measured in {frames} frames"
     return f"mode {known(scale.mode)}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
-
-
-def _agreement(found: AgreementMetrics) -> str:
-    return f"{written(known(found.sigmas), 1)} sigmas: {known(found.figure)}"
 
 
 def gps(metrics: Metrics) -> Table | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -13,13 +14,14 @@ from urllib.parse import quote
 from erfsfm.common.files import is_foreign
 from slam.commands.batch.execution import LOG_BEGIN, Outcome
 from slam.commands.batch.manifest import Drive
+from slam.formats.trajectory import Trajectory
 from slam.results.error_columns import written
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.results.report.rendering import Picture, render
 from slam.results.report.tables import Cell, Table
 from slam.results.report.verdict import verdict
-from slam.runtime.errors import RunError
+from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import REPORT
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import Missing, known
@@ -139,8 +141,11 @@ def _plots(whole: Sequence[Outcome], errors: Mapping[str, float]) -> Iterator[Pi
     if errors:
         figure = bars_figure(errors, "position error (% of the path)")
         yield Picture.of_plot("Error of each drive", "6 dof where lengths are metres, else 7 dof.", figure)
-    found = {o.drive.name: RunFolder(o.folder).trajectory("optimised") for o in whole[:_MOST_DRAWN]}
-    drives = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
+    drives: dict[str, Trajectory] = {}
+    for o in whole[:_MOST_DRAWN]:
+        with suppress(SlamError):
+            if (trajectory := RunFolder(o.folder).trajectory("optimised")) is not None:
+                drives[o.drive.name] = trajectory
     more = f" The first {_MOST_DRAWN} drives." if len(whole) > _MOST_DRAWN else ""
     if drives:
         caption = f"Optimised trajectories from one start, each in its own unit.{more}"

@@ -128,17 +128,18 @@ def scale_figure(trajectories: Mapping[str, Trajectory], is_metric: bool, gaps: 
     figure, reference = _panels("length / true length", "rotation error (deg)"), trajectories[REFERENCE]
     for name, estimate, truth in paired(trajectories):
         measured = associate(trajectories[name], reference)[0] if is_metric and name != "network" else estimate
-        frames = _frames(truth, trajectories)
+        frames, seconds = _frames(truth, trajectories), truth.stamps - reference.stamps[0]
         true_path, path = path_distance(truth.T_world_camera), path_distance(measured.T_world_camera)
         ends = np.searchsorted(true_path, true_path + true_path[-1] / _STRETCHES)
         starts = np.flatnonzero(ends < len(path))
         ends = ends[starts]
-        ratio = (path[ends] - path[starts]) / np.maximum(true_path[ends] - true_path[starts], 1e-9)
+        true_length = true_path[ends] - true_path[starts]
+        ratio = (path[ends] - path[starts]) / np.where(true_length > 0, true_length, np.nan)
         middle = (starts + ends) // 2
-        figure.add_trace(_line(name, truth.stamps[middle], ratio, frames[middle], "%{y:.3f} at %{x:.1f} s"), 1, 1)
+        figure.add_trace(_line(name, seconds[middle], ratio, frames[middle], "%{y:.3f} at %{x:.1f} s"), 1, 1)
         turned = np.swapaxes(truth.T_world_camera[:, :3, :3], 1, 2) @ estimate.T_world_camera[:, :3, :3]
         off = np.rad2deg(rotation_angle(turned))
-        line = _line(name, truth.stamps, off, frames, "%{y:.2f} deg at %{x:.1f} s", showlegend=False)
+        line = _line(name, seconds, off, frames, "%{y:.2f} deg at %{x:.1f} s", showlegend=False)
         figure.add_trace(line, 2, 1)
     figure.update_yaxes(rangemode="tozero", row=2)
     return _over_time(figure, reference, gaps)
@@ -147,18 +148,18 @@ def scale_figure(trajectories: Mapping[str, Trajectory], is_metric: bool, gaps: 
 def motion_figure(trajectories: Mapping[str, Trajectory], unit: str, gaps: Iterable[Stretch]) -> go.Figure:
     """Speed, and angles of the optimised trajectory, over time: what shows of scale and rotation without truth."""
     figure, drawn = _panels(f"speed ({unit} / s)", "angles (deg)"), aligned(trajectories)
-    for name, trajectory in drawn.items():
-        seconds = np.maximum(np.diff(trajectory.stamps), 1e-9)
-        speed = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1) / seconds
-        frames = _frames(trajectory, drawn)[1:]
-        figure.add_trace(_line(name, trajectory.stamps[1:], speed, frames, "%{y:.3f} at %{x:.1f} s"), 1, 1)
     last = drawn.get("optimised") or next(iter(drawn.values()))
+    for name, trajectory in drawn.items():
+        steps, seconds = np.diff(trajectory.positions, axis=0), trajectory.stamps[1:] - last.stamps[0]
+        speed = np.linalg.norm(steps, axis=1) / np.maximum(np.diff(trajectory.stamps), 1e-9)
+        frames = _frames(trajectory, drawn)[1:]
+        figure.add_trace(_line(name, seconds, speed, frames, "%{y:.3f} at %{x:.1f} s"), 1, 1)
     angles = np.unwrap(Rotation.from_matrix(last.T_world_camera[:, :3, :3]).as_euler("YXZ"), axis=0)
     for name, colour, values in zip(("Yaw", "Pitch", "Roll"), COLOURS[1:], np.rad2deg(angles).T):
         words = f"frame %{{customdata}}: {name} %{{y:.2f}} deg at %{{x:.1f}} s<extra></extra>"
         line = {"name": name, "line": {"color": colour, "width": 1.6}, "hovertemplate": words, "mode": "lines"}
-        frames = _frames(last, drawn)
-        figure.add_trace(go.Scatter(x=_single(last.stamps), y=_single(values), customdata=frames, **line), 2, 1)
+        frames, seconds = _frames(last, drawn), last.stamps - last.stamps[0]
+        figure.add_trace(go.Scatter(x=_single(seconds), y=_single(values), customdata=frames, **line), 2, 1)
     return _over_time(figure, last, gaps)
 
 
@@ -175,18 +176,6 @@ def noise_figure(coverage: CoverageMetrics, by_source: Mapping[str, CoverageMetr
         figure.add_hline(y=level, line={"color": colour, "dash": "dash", "width": 1.2})
     figure.update_yaxes(title="factors inside (%)", range=(0, 104))
     return figure.update_layout(height=_PANEL + 90)
-
-
-def curves_figure(x: str, panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]]) -> go.Figure:
-    """Curves with markers, a panel below the other, each named by its axis."""
-    figure = _panels(*panels)
-    colours = iter(COLOURS * len(panels))
-    for row, curves in enumerate(panels.values(), 1):
-        for name, (places, values) in curves.items():
-            line = {"name": name, "line": {"color": next(colours)}, "hovertemplate": "%{y:.3f} at %{x:.1f}"}
-            figure.add_trace(go.Scatter(x=places, y=values, mode="lines+markers", **line), row, 1)
-    figure.update_xaxes(title=x, row=len(panels))
-    return figure.update_yaxes(rangemode="tozero")
 
 
 def _line(name: str, x: FloatArray, y: FloatArray, frames: Any, words: str, **more: Any) -> go.Scatter:
@@ -221,8 +210,8 @@ def _panels(*titles: str) -> go.Figure:
 
 def _over_time(figure: go.Figure, trajectory: Trajectory, gaps: Iterable[Stretch]) -> go.Figure:
     for gap in gaps:
-        ends = trajectory.stamps[[max(gap.first - 1, 0), min(gap.last + 1, len(trajectory.stamps) - 1)]]
-        figure.add_vrect(*ends, fillcolor="#8b949e", opacity=0.25, line_width=0)
+        ends = trajectory.stamps[[max(gap.first - 1, 0), min(gap.last + 1, len(trajectory) - 1)]]
+        figure.add_vrect(*(ends - trajectory.stamps[0]), fillcolor="#8b949e", opacity=0.25, line_width=0)
     return figure.update_xaxes(title="time (s)", row=2)
 
 

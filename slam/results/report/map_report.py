@@ -1,4 +1,4 @@
-"""The map in the report: its size, its error against the true surface, and the error over distance."""
+"""The map in the report: its size, and its error against the true surface, also by distance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from slam.results.metrics import MapSizes, Metrics
 from slam.results.report.tables import Cell, Table, notes_on, number
 from slam.runtime.storage.record import Missing, known
 
-Curve = tuple[Sequence[float], Sequence[float]]
 _Value = Callable[[SurfaceMetrics | Missing], float | Missing]
 _ERRORS: dict[str, _Value] = {
     "accuracy, median (m)": lambda m: m.accuracy_median_m,
@@ -84,32 +83,16 @@ def map_errors_table(metrics: Metrics) -> Table | None:
     if not isinstance(found.in_field.share, Missing) and found.in_field.share != 1.0:
         rows.append(_row("where the scanner looked", found.in_field))
     rows.append(_row("with one scale", found.with_scale))
+    rings = _rings(metrics)
+    if rings:
+        is_rigid = not isinstance(found.by_distance, Missing)
+        rows.append("By distance from the nearest camera" + ("" if is_rigid else ", with one scale"))
+        rows += [_row(f"{known(ring.from_m):.0f} to {known(ring.to_m):.0f} m", ring) for ring in rings]
     length = number(found.evaluated_m).text
     truth = _TRUTHS.get(found.truth, found.truth)
     words = f"Against {truth}, {length} m of road. Map where no surface was measured is an error."
     missing = (number(value(found)).tooltip for value in _ERRORS.values())
     return Table(["", *_ERRORS], rows, notes=[words, *notes_on(missing)])
-
-
-def map_curves(metrics: Metrics) -> dict[str, dict[str, Curve]]:
-    """Errors over the distance from the nearest camera, a panel each; empty where fewer than two are known."""
-    panels = {
-        "to the true surface (m)": {"median": "accuracy, median (m)", "90 %": "accuracy, 90 % (m)"},
-        "share": {name: name for name in ("completeness, 0.3 m", "F-score, 0.5 m", "F-score, 0.2 m")},
-    }
-    found = {
-        axis: {label: _curve(_rings(metrics), name) for label, name in each.items()} for axis, each in panels.items()
-    }
-    return found if len(found["to the true surface (m)"]["median"][0]) > 1 else {}
-
-
-def _curve(rings: Sequence[Ring], name: str) -> Curve:
-    points = []
-    for ring in rings:
-        low, high, value = known(ring.from_m), known(ring.to_m), known(_ERRORS[name](ring))
-        if low is not None and high is not None and value is not None:
-            points.append((0.5 * (low + high), value))
-    return [middle for middle, _ in points], [value for _, value in points]
 
 
 def _row(name: str, errors: SurfaceMetrics | Missing) -> list[Cell]:

@@ -11,7 +11,7 @@ from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
 from slam.results.report import tables as report_tables
-from slam.results.report.map_report import map_curves, map_errors_table, map_filters, map_sizes
+from slam.results.report.map_report import map_errors_table, map_filters, map_sizes
 from slam.results.report.map_view import MapViews
 from slam.results.report.plots import length_unit, trajectories_of
 from slam.results.report.rendering import Picture, render
@@ -107,7 +107,7 @@ def _plots(
     """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
     from slam.results.report import figures
 
-    found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": [], "map errors": [], "noise": []}
+    found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": [], "noise": []}
 
     def add(section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> None:
         try:
@@ -137,10 +137,6 @@ def _plots(
         driven = {name: each for name, each in trajectories.items() if name == "optimised"}
         caption = "The map from above in its own colours, with the optimised trajectory."
         add("map", "Map from above", caption, figures.trajectories_figure, driven, unit, (), views.above)
-    if panels := map_curves(metrics):
-        caption = "Error of the map by the distance of its points, and of the true surface, from the nearest camera."
-        axis = "distance from the camera (m)"
-        add("map errors", "Map error over distance", caption, figures.curves_figure, axis, panels)
     if (coverage := known(metrics.graph.coverage)) is not None:
         by_source = known(metrics.graph.coverage_by_source) or {}
         add("noise", "Stated noise", _NOISE, figures.noise_figure, coverage, by_source)

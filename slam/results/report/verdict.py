@@ -55,7 +55,8 @@ def _sentence(metrics: Metrics, confirmed: str) -> str:
         known_by = f"but {confirmed}" if confirmed else "and neither a loop nor another source confirms it"
         return f"Without a truth its error is unknown, {known_by}; {means}."
     part = f", {percent(error / length)} of its {length:.3g} m" if length else ""
-    after = "with its own metric scale" if metrics.is_metric else f"after one fitted scale; {_no(metrics.unit)}"
+    own = "with its scale from the truth" if metrics.scale.mode == "reference" else "with its own metric scale"
+    after = own if metrics.is_metric else f"after one fitted scale; {_no(metrics.unit)}"
     return f"The trajectory is {error:.2g} m off the truth (RMSE{part}), {after}."
 
 

@@ -109,7 +109,7 @@ def test_it_draws_and_turns_without_a_word_on_the_console(report: Path) -> None:
 def test_every_plot_is_drawn_and_nothing_offers_to_send_it(report: Path) -> None:
     page, console = browse(report, "--dump-dom")
     assert console == []
-    assert page.count('class="plot"') == page.count('class="modebar-container"') == 7
+    assert page.count('class="plot"') == page.count('class="modebar-container"') == 6
     titles = set(re.findall('data-title="([^"]*)"', page))
     assert titles == {"Zoom", "Pan", "Reset axes", "Download plot as a PNG"}
 

@@ -98,7 +98,6 @@ def test_its_plots_have_the_numbers_of_the_run(full: RunFolder) -> None:
         "Position error along the path",
         "Drift by the length of segments",
         "Map from above",
-        "Map error over distance",
         "Stated noise",
     ]
     lines = {line["name"]: line for line in found["Position error along the path"]["data"]}
@@ -193,4 +192,4 @@ def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_ru
     write_report(folder)
     html, _ = parsed(folder)
     assert "not drawn, no time stamps match" in html
-    assert list(plots(html)) == ["Map error over distance", "Stated noise"]
+    assert list(plots(html)) == ["Stated noise"]

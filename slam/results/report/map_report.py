@@ -11,12 +11,12 @@ from slam.runtime.storage.record import Missing, known
 
 _Value = Callable[[SurfaceMetrics | Missing], float | Missing]
 _ERRORS: dict[str, _Value] = {
-    "accuracy, median (m)": lambda m: m.accuracy_median_m,
-    "accuracy, 90 % (m)": lambda m: m.accuracy_90_m,
-    "over 1 m": lambda m: m.outlier_share,
-    "completeness, 0.3 m": lambda m: m.completeness,
-    "F-score, 0.2 m": lambda m: m.f_score.m02,
-    "F-score, 0.5 m": lambda m: m.f_score.m05,
+    "accuracy, median\u00a0(m)": lambda m: m.accuracy_median_m,
+    "accuracy, 90\u00a0%\u00a0(m)": lambda m: m.accuracy_90_m,
+    "over 1\u00a0m": lambda m: m.outlier_share,
+    "completeness, 0.3\u00a0m": lambda m: m.completeness,
+    "F-score, 0.2\u00a0m": lambda m: m.f_score.m02,
+    "F-score, 0.5\u00a0m": lambda m: m.f_score.m05,
 }
 _FILTERS = {
     "unknown": "no depth",

@@ -17,7 +17,7 @@ from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
-from slam.frontend.drive import Drive, Examples
+from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, lidar_steps
@@ -291,13 +291,11 @@ class SlamPipeline:
             logger.warning(
                 "the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first
             )
-        examples = Examples(None if frames is not None else range(first, total))
         observer = Observer(
             self._predictor,
             self._sequence.intrinsics,
             self._config,
             self._watch,
-            examples,
             self._seed,
             state,
             self._sequence.camera_height_m,

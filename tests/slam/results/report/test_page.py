@@ -137,9 +137,9 @@ def test_the_first_sentence_says_how_good_it_is_and_why(make_run: MakeRun, make_
     doubtful = said(agreement=contradicted, loops={"candidates": 9, "verified": 0, "accepted": 0, "rejected": []})
     assert "no loop closes it (9 candidates), so drift adds up" in doubtful
     assert "lidar contradicts the images (3.2 sigmas: its steps turn otherwise)" in doubtful
-    metrics = make_metrics(reference=False, mode="none")
-    unknown = said(**metrics)
-    assert "Without a truth its error is unknown, but 1 of 3 measured loops agree and close it; its lengths" in unknown
+    unknown = said(**make_metrics(reference=False, mode="none"), confidence={"run": 0.97})
+    assert "its error is unknown: 97 % of drives like it err by at most 1 % of their path" in unknown
+    assert "and 1 of 3 measured loops agree and close it; its lengths" in unknown
 
 
 def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None:

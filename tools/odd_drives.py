@@ -33,7 +33,7 @@ from slam.simulation.options import SimulationOptions
 
 WORDS = ("every word of this line hides a part of the road", "and the next line hides another part of it")
 FRAMES = 110
-WRONG, GOOD = 1.0, 0.8  # percent of the path, and confidence
+WRONG = 1.0  # percent of the path
 
 
 def _zoomed(image: Image, ratio: float) -> Image:
@@ -184,7 +184,7 @@ def summary(outcomes: Sequence[Outcome]) -> list[str]:
     """How many drives err by how much, by their confidence."""
     ran = [each for each in outcomes if np.isfinite(each.error_percent)]
     lines = []
-    for least, most in pairwise((0.0, 0.3, 0.6, GOOD, 0.9, 1.01)):
+    for least, most in pairwise((0.0, 0.3, 0.6, 0.85, 1.01)):
         among = [each for each in ran if least <= each.confidence < most]
         right = sum(each.error_percent <= WRONG for each in among)
         lines.append(

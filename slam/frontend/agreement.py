@@ -32,11 +32,11 @@ _FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens 
 # of good drives (docs/reliability.md): mean and spread
 _SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
-_FAR_SPREAD, _FAR_CORNERS = 0.15, 0.05  # of the logarithm; and least corners over the most of a distance
+_FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
-_SIGMAS, _CONFIDENCE = (1.0, 2.0, 3.0, 5.0), (0.97, 0.8, 0.4, 0.1)
+_SIGMAS, _CONFIDENCE = (1.0, 1.5, 2.0, 3.0, 5.0), (0.97, 0.85, 0.5, 0.2, 0.05)
 
 
 @dataclass(frozen=True)

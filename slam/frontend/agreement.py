@@ -30,7 +30,7 @@ _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
 _FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens bias it
 # of good drives (docs/reliability.md): mean and spread
-_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
+USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
@@ -149,7 +149,7 @@ def of_images(
 def frame_support(frames: int, motions: Sequence[Motion], located: Collection[int]) -> FloatArray:
     """The support of the motion to each frame ``(N,)``, 0 without one; frames ``located`` in a map have the usual."""
     support = np.zeros(frames)
-    support[list(located)] = _SUPPORT
+    support[list(located)] = USUAL_SUPPORT
     for motion in motions:
         support[motion.ends[1]] = max(support[motion.ends[1]], motion.support)
     support[:1] = support[1:2]
@@ -167,4 +167,4 @@ def confidence_of_frames(support: FloatArray) -> FloatArray:
 
 
 def _support_sigmas(support: FloatArray | float) -> FloatArray:
-    return np.maximum((_SUPPORT - np.asarray(support)) / _SUPPORT_SPREAD, 0.0)
+    return np.maximum((USUAL_SUPPORT - np.asarray(support)) / _SUPPORT_SPREAD, 0.0)

@@ -43,7 +43,7 @@ demo: setup
 test: lint
 	$(PYTEST) -m 'not slow'
 
-test-all: lint
+test-all: lint $(DOCS)/.ready
 	$(PYTEST)
 
 lint: setup

@@ -18,6 +18,7 @@ _FROM = {
 }
 _WIDE_SPREAD, _FEW = 0.15, 0.5  # of the scale; frames that measured it over all
 _LARGEST_SCALE_ERROR = 0.03
+_SURE = 0.5
 _NOISE_POINTS = 0.12  # share of factors off the promised one
 
 
@@ -35,7 +36,7 @@ def verdict(metrics: Metrics) -> Verdict | None:
     if metrics.failure:
         return None
     found: tuple[list[str], list[str]] = [], []
-    for part in (_loops, _agreement, _unit, _noise, _frames, _map):
+    for part in (_confidence, _loops, _agreement, _unit, _noise, _frames, _map):
         for is_sign, words in part(metrics):
             found[0 if is_sign else 1].append(words)
     confirmed = next((words for is_sign, words in _loops(metrics) if is_sign), "")
@@ -92,9 +93,17 @@ def _loops(metrics: Metrics) -> Iterator[tuple[bool, str]]:
         yield False, f"drift adds up: {metrics.loops.accepted.reason}"
 
 
+def _confidence(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    sure = known(metrics.confidence.run)
+    if sure is not None:
+        yield sure > _SURE, f"{percent(sure)} of drives with images like its own err by at most 1 % of their path"
+
+
 def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     for each in known(metrics.agreement) or ():
         sigmas = known(each.sigmas) or 0.0
+        if sigmas <= DOUBTFUL and each.beside != "the images":
+            continue  # `_confidence` says it of all
         verb = "agrees with" if sigmas <= DOUBTFUL else "contradicts"
         yield sigmas <= DOUBTFUL, f"{each.source} {verb} {each.beside} ({sigmas:.1f} sigmas: {known(each.figure)})"
     off = known(metrics.gps.optimised.horizontal_rmse_m)

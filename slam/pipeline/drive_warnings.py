@@ -15,6 +15,7 @@ _MOST_NAMED = 10
 # real drives with automatic exposure have 0.13 at ten frames a second and 0.51 at two
 _ROLLING_EXPOSURE = 0.6
 _LEAST_COMPARED = 30
+_LEAST_STANDING = 0.02  # of the image
 
 
 def warn_of_doubts(drive: Drive, gate: GateState) -> None:
@@ -37,7 +38,7 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
             gate.exposed,
             gate.compared,
         )
-    if gate.standing is not None:
+    if gate.standing is not None and gate.standing.mean() > _LEAST_STANDING:
         logger.warning(
             "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
             "road is taken from there",

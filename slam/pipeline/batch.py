@@ -36,7 +36,7 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
-from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_contradicted_steps, warn_of_doubts
+from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_doubts
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.input_checks import require_possible
@@ -151,7 +151,7 @@ class SlamPipeline:
         scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
         support = agreement.frame_support(len(drive), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
-        of_images = agreement.of_images(drive, state.odometry, support, len(scale.contradicted), needs_road)
+        of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         if closure is None:
             with self._watch.stage("loops"):
@@ -207,7 +207,6 @@ class SlamPipeline:
         config = self._config
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
-        warn_of_contradicted_steps(scale)
         factors = make_factors(drive, scale, self._noise, config.pose_network, config.visual_odometry)
         T_odometry = chain_odometry(factors, T_network, scale)
         if self.mode in ("reference", "known", "gps"):

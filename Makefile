@@ -3,6 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS := .venv-docs
 # An index of torch builds, if another than the default is wanted (see README, "Which torch")
 TORCH_INDEX ?=
 
@@ -14,7 +15,7 @@ UV ?= uv
 # Tests are of one thread each; a file's tests stay together, for they share what they prepare
 PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-.PHONY: setup lock demo test test-all lint benchmark dist publish clean
+.PHONY: setup lock demo test test-all lint docs benchmark dist publish clean
 
 setup: $(READY)
 
@@ -33,6 +34,8 @@ lock:
 	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --extra dev --constraint constraints.txt \
 		--override .no-torch.txt --no-annotate --no-header --output-file requirements.lock pyproject.toml
 	rm .no-torch.txt
+	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --group docs --constraint constraints.txt \
+		--no-annotate --no-header --output-file requirements-docs.lock
 
 demo: setup
 	$(BIN)/erfsfm-slam run
@@ -40,13 +43,22 @@ demo: setup
 test: lint
 	$(PYTEST) -m 'not slow'
 
-test-all: lint
+test-all: lint $(DOCS)/.ready
 	$(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# MkDocs stays out of .venv; it reads the code there
+$(DOCS)/.ready: requirements-docs.lock $(READY)
+	rm -rf $(DOCS)
+	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --target $(DOCS) --requirement requirements-docs.lock
+	@touch $@
+
+docs: $(DOCS)/.ready
+	PYTHONPATH=$(DOCS) $(BIN)/python tools/docs_site.py
 
 benchmark: setup
 	$(BIN)/python -m pytest -q -s tests/benchmarks
@@ -61,4 +73,4 @@ publish: dist
 	$(BIN)/python -m twine upload dist/*
 
 clean:
-	rm -rf $(VENV) results runs dist build
+	rm -rf $(VENV) $(DOCS) results runs dist build site

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -15,7 +16,7 @@ evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of 
 @evaluate_app.command("depth")
 def evaluate_depth(
     dataset: Annotated[
-        Path, typer.Option(help="a root with true depth (erfsfm-slam simulate --depth), or KITTI raw with --split")
+        list[Path], typer.Option(help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat")
     ],
     weights: Weights = "default",
     truth: Annotated[
@@ -34,15 +35,17 @@ def evaluate_depth(
     ] = None,
     fidelity: Fidelity = "default",
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
+    output: Annotated[Path | None, typer.Option(help="a file that receives the JSON as well")] = None,
     device: Device = "auto",
     seed: UnusedSeed = 0,
     as_json: Json = False,
 ) -> None:
-    """Depth errors under 80 m: Eigen's protocol with --split, else every fifth frame beside a median depth map.
+    """Depth errors under 80 m: Eigen's protocol with --split, else every fifth frame, and every street counts alike.
 
-    With --truth many-views no true depth is needed: static surfaces are measured from their neighbouring frames.
+    The table has the standard error of abs_rel by blocks of consecutive images; JSON has all errors. With --truth
+    many-views no true depth is needed: static surfaces are measured from their neighbouring frames.
 
-    Example: erfsfm evaluate depth --weights sim --dataset KITTI_RAW --split eigen --fidelity paper
+    Example: erfsfm evaluate depth --weights sim --dataset worlds --dataset KITTI_RAW --output depth.json
     """
     from erfsfm.common.errors import ConfigError
     from erfsfm.common.progress import progress_bar
@@ -57,15 +60,34 @@ def evaluate_depth(
         raise ConfigError("--sequence and --cache belong to --truth many-views")
     if fidelity == "paper" and split is None:
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
+    if len(dataset) > 1 and (truth == "many-views" or split is not None):
+        raise ConfigError(f"--split and --truth many-views take one --dataset; got {len(dataset)}")
     predictor = DepthPosePredictor.from_weights(weights, device)
-    if truth == "many-views":
-        with progress_bar() as show:
-            rows = many_view_protocol(predictor, dataset, sequence or (), cache, allow_leak, show)
-        print_rows(rows, as_json)
-    elif split is None:
-        print_rows(depth_protocol(predictor, dataset, allow_leak), as_json)
-    else:
-        print_rows(eigen_protocol(predictor, dataset, split, fidelity, allow_leak), as_json)
+    with progress_bar() as show:
+        if truth == "many-views":
+            rows = many_view_protocol(predictor, dataset[0], sequence or (), cache, allow_leak, show)
+        elif split is None:
+            rows = depth_protocol(predictor, dataset, allow_leak, show)
+        else:
+            rows = eigen_protocol(predictor, dataset[0], split, fidelity, allow_leak)
+    _show(rows, output, as_json)
+
+
+def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
+    """Write the rows, if a file is named, and print them."""
+    from erfsfm.common.files import write_atomically
+
+    if output is not None:
+        write_atomically(output, lambda path: path.write_text(json.dumps(rows, indent=2) + "\n"))
+    print_rows(rows if as_json else [_narrow(row) for row in rows], as_json)
+
+
+def _narrow(row: dict[str, Any]) -> dict[str, Any]:
+    """What of a street's row fits into a table of 80 columns; another row as it is."""
+    if "abs_rel_se" not in row:
+        return row
+    shown = {"method": row.get("street", row["method"]), "abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
+    return shown | {key: row[key] for key in ("rmse", "a1", "images", "leak")}
 
 
 @evaluate_app.command("pose")

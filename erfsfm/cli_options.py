@@ -25,6 +25,7 @@ def print_rows(rows: list[dict[str, Any]], as_json: bool) -> None:
         values = ["-" if row.get(key) is None else row[key] for row in rows]
         cells = [key, *(f"{value:.4f}" if isinstance(value, float) else str(value) for value in values)]
         width = max(map(len, cells))
-        columns.append([cell.ljust(width) if isinstance(values[0], str) else cell.rjust(width) for cell in cells])
+        is_text = all(isinstance(value, str) for value in values)
+        columns.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in cells])
     for line in zip(*columns):
         typer.echo("  ".join(line).rstrip())

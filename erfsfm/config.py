@@ -24,7 +24,9 @@ class NetworkConfig(Section):
 
     depth: str = Field(default="depthnet", description="preset of the depth network, see erfsfm networks")
     pose: str = Field(default="posenet", description="preset of the pose network, see erfsfm networks")
-    fidelity: Fidelity = Field(default="default", description="paper: the layers of the reference code, exactly")
+    fidelity: Fidelity = Field(
+        default="default", description="paper: layers, intrinsics and photometric error of the reference code"
+    )
     depth_width: float = Field(default=1.0, gt=0, le=4, description="factor on the depth network's channels")
     pose_width: float = Field(default=1.0, gt=0, le=4, description="factor on the pose network's channels")
     normalisation: Literal["none", "batch"] = Field(
@@ -217,6 +219,12 @@ class TrainingConfig(Section):
     )
     schedule: Literal["constant", "cosine", "step"] = Field(
         default="constant", description="of the learning rate; step: divided by ten in the last quarter"
+    )
+    average_decay: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="of the moving average of the weights at every step, which is validated and written; 0: none",
     )
     gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
     validate_every: int = Field(default=1000, ge=1, description="steps between validations")

@@ -270,9 +270,10 @@ def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray
 
 
 def colour_disparity(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A picture ``(H, W, 3)`` RGB of 1/depth: near is bright, the nearest 2 % saturate."""
-    disparity = 1 / depth
-    low, high = np.percentile(disparity, [1, 98])
+    """A picture ``(H, W, 3)`` RGB of 1/depth: near is bright, the nearest 2 % saturate, unknown is black."""
+    is_known = np.isfinite(depth) & (depth > 0)
+    disparity = 1 / np.where(is_known, depth, np.float32(np.inf))
+    low, high = np.percentile(disparity[is_known], [1, 98]) if is_known.any() else (0.0, 1.0)
     shade = np.clip((disparity - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
 

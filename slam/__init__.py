@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from erfsfm import DISTRIBUTION as DISTRIBUTION
+
+if TYPE_CHECKING:
+    from slam.commands.run.run import run_slam
+    from slam.pipeline.live import Slam
+    from slam.results.folder import RunFolder
 
 __all__ = ["RunFolder", "Slam", "run_slam"]
 

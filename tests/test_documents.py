@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import re
 import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,12 @@ from erfsfm.config import ExperimentConfig
 from slam.config.sections import SlamConfig
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+docs_site = importlib.import_module("docs_site")
 PAGES = [
     *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
     *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "erfsfm/weights").rglob("README.md")),
 ]
 NAMING = [path for kind in ("slam", "erfsfm", "tools", "tests", "configs") for path in (ROOT / kind).rglob("*.*")]
 PROGRAMS = {"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.commands.cli.app}
@@ -80,6 +85,12 @@ def test_the_index_lists_every_page() -> None:
     docs = ROOT / "docs"
     listed = {(docs / target).resolve() for target, _ in LINK.findall((docs / "README.md").read_text(encoding="utf-8"))}
     assert listed == {*docs.rglob("*.md"), *docs.rglob("*.ipynb")} - {docs / "README.md"}
+
+
+def test_the_site_has_every_page_once() -> None:
+    nav = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    in_docs = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert sorted(nav) == sorted(in_docs - {"README.md"} | docs_site.pages().keys())
 
 
 def test_commands_that_are_named_exist(page: Path) -> None:

@@ -1,12 +1,14 @@
-"""The lock file holds the versions of ``constraints.txt``, a hash for each, and nothing about where they come from."""
+"""The lock files hold the versions of ``constraints.txt``, hashes for each, and nothing about where they come from."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
-LOCK = (ROOT / "requirements.lock").read_text()
+LOCK, DOCS = ((ROOT / name).read_text() for name in ("requirements.lock", "requirements-docs.lock"))
 
 
 def pins(text: str) -> dict[str, str]:
@@ -15,14 +17,16 @@ def pins(text: str) -> dict[str, str]:
 
 
 def test_versions_are_those_of_the_constraints() -> None:
-    assert pins(LOCK) == pins((ROOT / "constraints.txt").read_text()), "run make lock"
+    wanted = pins((ROOT / "constraints.txt").read_text())
+    assert pins(LOCK) | pins(DOCS) == pins(DOCS) | pins(LOCK) == wanted, "run make lock"
 
 
-def test_every_package_has_hashes_and_no_address() -> None:
-    packages = re.split(r"\n(?=\S)", LOCK.strip())
-    assert len(packages) == len(pins(LOCK))
+@pytest.mark.parametrize("lock", [LOCK, DOCS], ids=["requirements", "requirements-docs"])
+def test_every_package_has_hashes_and_no_address(lock: str) -> None:
+    packages = re.split(r"\n(?=\S)", lock.strip())
+    assert len(packages) == len(pins(lock))
     assert not [each.split()[0] for each in packages if "--hash=sha256:" not in each]
-    assert "://" not in LOCK and "--index" not in LOCK and "--find-links" not in LOCK
+    assert "://" not in lock and "--index" not in lock and "--find-links" not in lock
 
 
 def test_torch_is_left_to_the_user() -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from shared.command import parser_of
 
 from slam import run_slam
+from slam.frames import Sequence as FrameSequence
 from slam.geometry.se3 import FloatArray, umeyama
 from slam.results.metrics import SequenceMetrics
 from slam.runtime.errors import SlamError
@@ -60,9 +61,14 @@ class Drive:
 def simulated(frames: int, seed: int) -> tuple[Drive, SimulatedSequence]:
     """The clean drive of a simulated world."""
     sequence = SimulatedSequence(SimulationOptions(route="grid", frames=frames, seed=seed))
+    return whole(sequence), sequence
+
+
+def whole(sequence: FrameSequence) -> Drive:
+    """All frames of a sequence with true poses."""
+    frames = len(sequence)
     images = [sequence.frame(k).image for k in range(frames)]
-    poses = np.asarray(sequence.reference)
-    return Drive(images, sequence.stamps, poses, np.ones(frames, bool)), sequence
+    return Drive(images, sequence.stamps, np.asarray(sequence.reference), np.ones(frames, bool))
 
 
 def _encoded(image: Image, quality: int) -> Image:
@@ -156,17 +162,20 @@ class Outcome:
     reported: tuple[str, ...]
 
 
-def write_root(root: Path, drive: Drive, sequence: SimulatedSequence) -> None:
-    """A KITTI odometry root."""
+def write_root(root: Path, drive: Drive, sequence: FrameSequence, focal_ratio: float = 1.0) -> None:
+    """A KITTI odometry root with the camera of a sequence, or with another focal length."""
+    intrinsics = sequence.intrinsics
+    intrinsics = replace(intrinsics, fx=focal_ratio * intrinsics.fx, fy=focal_ratio * intrinsics.fy)
+    T_camera_lidar = np.eye(4) if sequence.T_camera_lidar is None else np.asarray(sequence.T_camera_lidar)
     folder = root / "sequences" / "sim"
     (folder / "image_2").mkdir(parents=True)
     (root / "poses").mkdir()
     for k, image in enumerate(drive.images):
         write_image(folder / "image_2" / f"{k:06d}.png", image)
-    write_calibration(folder / "calib.txt", sequence.intrinsics.K, np.asarray(sequence.T_camera_lidar))
+    write_calibration(folder / "calib.txt", intrinsics.K, T_camera_lidar)
     write_lines(folder / "times.txt", [f"{stamp:.6e}" for stamp in drive.stamps])
     write_poses(root / "poses" / "sim.txt", drive.T_world_camera)
-    camera = {name: getattr(sequence.intrinsics, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    camera = {name: getattr(intrinsics, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     camera |= {"fps": FPS, "camera_height_m": sequence.camera_height_m}
     write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()])
 

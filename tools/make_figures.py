@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from shared.command import one_line_errors, parser_of
 
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import DepthPosePredictor, colour_disparity
 from slam.frames import Sequence
 from slam.results.folder import RunFolder
 from slam.results.report.map_mesh import MapMeshFile
 from slam.results.report.map_view import MapScene
-from slam.results.report.plots import depth_figure, map_figure, trajectories_figure, trajectories_of
+from slam.results.report.plots import draw_trajectories, figure_style, map_figure, trajectories_of
 from slam.runtime.run_files import MAP_MESH
 from slam.sequences.catalogue import open_sequence
 
@@ -67,11 +67,14 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
     """Depth of some frames above the trajectories and the map."""
     chosen = np.linspace(0, len(sequence) - 1, 5).round().astype(int)[1:-1]
     images = [sequence.frame(int(k)).image for k in chosen]
-    depths = [predictor.depth(image) for image in images]
+    strips = [np.concatenate([image, colour_disparity(predictor.depth(image))]) for image in images]
     trajectories = trajectories_of(folder)
     scene = MapScene(MapMeshFile(folder.require(MAP_MESH)).reduced(1_000_000))
-    top = _raster(depth_figure(images, depths, [f"frame {k}" for k in chosen]), WIDTH_PX)
-    left = _raster(trajectories_figure("trajectory", trajectories, "trajectories"), WIDTH_PX // 2)
+    top = _narrowed(np.concatenate(strips, axis=1), WIDTH_PX)
+    with figure_style() as new_figure:
+        figure = new_figure(figsize=(7.4, 5.6), layout="constrained")
+        draw_trajectories(figure, trajectories, "m")
+        left = _raster(figure, WIDTH_PX // 2)
     map_picture = map_figure(scene.from_above(trajectories["optimised"].positions), trajectories["optimised"])
     right = _raster(map_picture, WIDTH_PX - WIDTH_PX // 2)
     height = max(left.shape[0], right.shape[0])
@@ -83,9 +86,12 @@ def _raster(figure: Figure, width: int) -> NDArray[np.uint8]:
     """A figure as pixels of a given width."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    return _narrowed(np.asarray(canvas.buffer_rgba())[..., :3], width)
+
+
+def _narrowed(pixels: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     height = round(pixels.shape[0] * width / pixels.shape[1])
-    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _padded(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:

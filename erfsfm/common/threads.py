@@ -39,6 +39,13 @@ def single_threaded_opencv() -> Iterator[None]:
         cv2.setNumThreads(threads)
 
 
+def stay_single_threaded() -> None:
+    """Start no threads in this process from here on, which is one of as many as there are cores."""
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when other libraries are loaded, and by `usable_cores`
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
+
+
 def take_working_memory() -> None:
     """Let linear algebra take its memory now: later, where none is left, OpenCV would end the process, and OpenBLAS,
     of which NumPy and SciPy have one each, would wait for ever.

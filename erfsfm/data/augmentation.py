@@ -23,7 +23,7 @@ def augment(
         maps: ``(H, W)`` each, per-pixel data: moved by nearest neighbour, never recoloured.
         camera: of these images.
         config: probabilities and largest changes.
-        fidelity: ``paper`` mirrors the principal point as the reference does.
+        fidelity: ``paper`` mirrors and scales the principal point as the reference does.
         rng: of all random draws.
 
     Returns:
@@ -35,22 +35,23 @@ def augment(
         maps = [np.ascontiguousarray(values[:, ::-1]) for values in maps]
         camera = camera.flipped(fidelity)
     if config.zoom > 1:
-        images, maps, camera = _scale_crop(images, maps, camera, config.zoom, rng)
+        images, maps, camera = _scale_crop(images, maps, camera, config.zoom, fidelity, rng)
     if config.colour_jitter > 0:
         images = _recolour(images, config.colour_jitter, rng)
     return images, maps, camera, mirrored
 
 
 def _scale_crop(
-    images: Images, maps: Maps, camera: Camera, zoom: float, rng: np.random.Generator
+    images: Images, maps: Maps, camera: Camera, zoom: float, fidelity: Fidelity, rng: np.random.Generator
 ) -> tuple[Images, Maps, Camera]:
     """Enlarge each axis by its own factor and crop back at a random place."""
     width, height = camera.width, camera.height
     zoom_x, zoom_y = rng.uniform(1, zoom, 2)
-    enlarged = camera.resized(int(width * zoom_x), int(height * zoom_y))
-    left = int(rng.integers(enlarged.width - width + 1))
-    top = int(rng.integers(enlarged.height - height + 1))
-    size, part = (enlarged.width, enlarged.height), (slice(top, top + height), slice(left, left + width))
+    size = int(width * zoom_x), int(height * zoom_y)
+    enlarged = camera.resized(*size) if fidelity == "default" else camera.multiplied(zoom_x, zoom_y)
+    left = int(rng.integers(size[0] - width + 1))
+    top = int(rng.integers(size[1] - height + 1))
+    part = slice(top, top + height), slice(left, left + width)
     crops = [np.ascontiguousarray(cv2.resize(i, size, interpolation=cv2.INTER_LINEAR)[part]) for i in images]
     moved = [np.ascontiguousarray(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT)[part]) for m in maps]
     return crops, moved, enlarged.cropped(left, top, width, height)

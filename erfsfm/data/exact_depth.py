@@ -38,7 +38,7 @@ class ExactImages:
         image = self._cache.image(recording, index)
         if rng.random() < self._config.data.weather:
             image = weathered([image], rng)[0]
-        camera = recording.camera.resized(network.width, network.height)
+        camera = recording.camera.resized(network.width, network.height, network.fidelity)
         bounds = [np.where(seen, most, 0).astype(np.float32), most.astype(np.float32)]
         return single_image(image, camera, bounds, self._config, rng)
 

@@ -23,8 +23,10 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
 from erfsfm.common.files import write_atomically
+from erfsfm.common.lock import FolderLock
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
+from erfsfm.common.threads import stay_single_threaded
 from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
@@ -38,6 +40,7 @@ VERSION = 1
 LARGEST_WIDTH = 800
 LEAST_NEIGHBOURS = 2
 _CHUNK = 8  # labels of one task
+_DIGITS = 32  # of a digest
 
 Measures = Literal["depth and poses", "poses"]
 Guess = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
@@ -214,7 +217,7 @@ class ManyViewTeacher:
         """Where the labels of a recording are kept."""
         known = self._drives.get(id(recording))
         if known is None:
-            folder = self._folder / _digest(recording)
+            folder = self._folder / self._digest(recording)
             known = self._drives[id(recording)] = DriveLabels(recording, folder, self._size, self._stride)
         return known
 
@@ -229,9 +232,17 @@ class ManyViewTeacher:
     def prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
         """Compute what is not there yet, in as many processes as there are cores.
 
+        Of several programs with one folder (the processes of a training on several devices) one computes and the
+        others wait for it.
+
         Raises:
             TrainingError: a drive has no trajectory or no scale, or poses by other weights.
         """
+        with FolderLock() as lock:
+            lock.wait_for(self._folder)
+            self._prepare(recordings, sources, weights, progress)
+
+    def _prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
         drives = [self.drive(recording) for recording in recordings]
         for drive in drives:
             drive.require_weights(weights)
@@ -246,7 +257,7 @@ class ManyViewTeacher:
         if not tasks:
             return
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(os.cpu_count(), context) as pool:
+        with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:
             running: list[Future[int]] = [
                 pool.submit(drive.measure_labels, chunk, self._guess) for drive, chunk in tasks
             ]
@@ -259,20 +270,28 @@ class ManyViewTeacher:
             finally:
                 pool.shutdown(cancel_futures=True)
 
+    def _digest(self, recording: Recording) -> str:
+        """Of the images, the camera, and the version of this file; kept by names, sizes and times of the images."""
+        images = sorted(set(recording.images))
+        start = f"{VERSION} {recording.camera} {recording.start} {len(recording)}"
+        files = [(path, path.stat()) for path in images]
+        seen = "\n".join([start, *(f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in files)])
+        kept = self._folder / "digests" / hashlib.sha256(seen.encode()).hexdigest()[:_DIGITS]
+        if kept.is_file() and len(known := kept.read_text()) == _DIGITS:
+            return known
+        digest = hashlib.sha256(start.encode())
+        for path in images:
+            digest.update(path.read_bytes())
+        known = digest.hexdigest()[:_DIGITS]
+        write_atomically(kept, lambda path: path.write_text(known), sync=False)
+        return known
+
 
 def _missing(drive: DriveLabels, sources: int) -> Iterator[list[int]]:
     """Frames without a label yet, in portions."""
     frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
     for first in range(0, len(frames), _CHUNK):
         yield frames[first : first + _CHUNK]
-
-
-def _digest(recording: Recording) -> str:
-    """Of the images, the camera, and the version of this file."""
-    digest = hashlib.sha256(f"{VERSION} {recording.camera} {recording.start} {len(recording)}".encode())
-    for path in sorted(set(recording.images)):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:32]
 
 
 def _save(path: Path, array: NDArray[Any]) -> None:

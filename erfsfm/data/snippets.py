@@ -84,7 +84,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             self._chosen(rng), lambda snippet: load_window(self._cache, snippet, network.sources + 1)
         )
         recording, which = snippet.recording, self.recordings.index(snippet.recording)
-        camera = recording.camera.resized(network.width, network.height)
+        camera = recording.camera.resized(network.width, network.height, network.fidelity)
         seen = self._structure(snippet, images, camera.K)
         return training_sample(images, camera, seen, (which, snippet.first), self._config, rng)
 
@@ -135,7 +135,8 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         snippet, network = self.snippets[item], self._network
         recording, length = snippet.recording, network.sources + 1
         images, depth = self._read(snippet)
-        sample = as_tensors(images, recording.camera.resized(network.width, network.height).K)
+        camera = recording.camera.resized(network.width, network.height, network.fidelity)
+        sample = as_tensors(images, camera.K)
         if depth is not None:
             sample["depth"] = torch.from_numpy(depth)
         T_world_camera = recording.true_poses()

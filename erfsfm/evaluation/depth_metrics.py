@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -9,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 MINIMUM_DEPTH_M = 1e-3
+CAP_M = 80.0  # farther truth is not compared
+BLOCK = 5  # images of a block
 Crop = Literal["none", "garg"]
 Scaling = Literal["none", "median"]
 Clipping = Literal["after", "before"]
@@ -100,6 +103,18 @@ def _scale(guess: NDArray[np.float64], truth: NDArray[np.float64], scaling: Scal
     if scaling == "median":
         return float(np.median(truth) / np.median(guess))
     return 1.0 if scaling == "none" else float(scaling)
+
+
+def block_error(values: Sequence[float]) -> float | None:
+    """Standard error of the mean of values in the order of a drive; None for fewer than two blocks.
+
+    Neighbouring images show the same things and err alike, so blocks of five or more are compared, not images.
+    """
+    count = len(values) // BLOCK
+    if count < 2:
+        return None
+    blocks = [np.mean(block) for block in np.array_split(np.asarray(values, dtype=np.float64), count)]
+    return float(np.std(blocks, ddof=1) / np.sqrt(count))
 
 
 def mean_errors(errors: list[DepthErrors]) -> DepthErrors:

@@ -15,8 +15,8 @@ from erfsfm.common.files import read_text
 from erfsfm.common.readers.images import read_image, resize_image
 from erfsfm.config import Fidelity
 from erfsfm.data.split_file import read_split_file
-from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
-from erfsfm.evaluation.protocols import CAP_M, PoseDepthNetworks, refuse_leak
+from erfsfm.evaluation.depth_metrics import CAP_M, DepthErrors, depth_errors, mean_errors
+from erfsfm.evaluation.protocols import PoseDepthNetworks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
 from erfsfm.model_record import ModelRecord
 

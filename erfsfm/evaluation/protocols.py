@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
+from erfsfm.evaluation.depth_metrics import BLOCK, CAP_M, DepthErrors, block_error, depth_errors, mean_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
+from erfsfm.evaluation.streets import find_streets
 
-CAP_M = 80.0
+_BASELINE = "median depth map"
 
 
 class PoseDepthNetworks(Protocol):
@@ -39,38 +41,43 @@ class PoseDepthNetworks(Protocol):
         ...
 
 
-def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, every: int = 5) -> list[dict[str, Any]]:
-    """Median-scaled depth errors under 80 m on every fifth frame with true depth.
+def depth_protocol(
+    networks: PoseDepthNetworks, roots: Sequence[Path], allow_leak: bool, progress: Progress = silent
+) -> list[dict[str, Any]]:
+    """Median-scaled depth errors under 80 m on the streets of all roots, each of which counts alike.
 
     Returns:
-        One row for the networks and one for the median depth map of the data, a baseline that uses no image.
+        One row for the networks, and, where depth is dense, one for the median depth map of a root, a baseline that
+        uses no image. Of several streets both are means, and a row for each street follows. ``abs_rel_se`` is the
+        standard error by `block_error`.
 
     Raises:
-        DataError: no true depth under the root, or a leak that was not allowed.
+        DataError: no true depth under a root, or a leak that was not allowed.
     """
-    if any(root.glob("????_??_??/*_sync")):
-        raise DataError(f"{root} holds KITTI raw drives: name their frames with --split eigen or --split FILE")
-    recordings = [r for r in discover(root) if any(r.depth or ())]
-    if not recordings:
-        raise DataError(f"no true depth in {root}: wanted sequences/NN/depth_2 (erfsfm-slam simulate --depth)")
-    leak = refuse_leak(networks, [r.frames_name for r in recordings], allow_leak)
-    frames = [(r, i) for r in recordings for i in np.flatnonzero([file is not None for file in r.depth or ()])[::every]]
-    truths = [r.true_depth(i) for r, i in frames]
-    sizes = {t.shape for t in truths if t is not None}
-    if len(sizes) > 1:
-        raise DataError(f"depth maps of different sizes in {root}: evaluate recordings of one size at a time")
-    typical = _median_map([t for t in truths if t is not None])
-    rows: dict[str, list[DepthErrors]] = {"networks": [], "median depth map": []}
-    for (recording, index), truth in zip(frames, truths):
-        assert truth is not None
-        image = recording.image(index, *truth.shape)  # of a pack the images are smaller
-        for name, guess in (("networks", networks.depth(image)), ("median depth map", typical)):
-            errors = depth_errors(guess, truth, CAP_M)
-            if errors is not None:
-                rows[name].append(errors)
-    if not rows["networks"]:
-        raise DataError(f"no depth between 0 and {CAP_M:g} m in {root}: nothing to compare with")
-    return [_depth_row(name, errors, leak) for name, errors in rows.items()]
+    streets = [street for root in roots for street in find_streets(root)]
+    leaks = [refuse_leak(networks, street.seen, allow_leak) for street in streets]
+    total = sum(len(street.frames) for street in streets)
+    each: dict[str, list[list[DepthErrors]]] = {"networks": [], _BASELINE: []}
+    done = 0
+    for street in streets:
+        errors: dict[str, list[DepthErrors]] = {"networks": [], _BASELINE: []}
+        for load in street.frames:
+            progress("depth", done, total)
+            image, truth = load()
+            for name, guess in (("networks", networks.depth(image)), (_BASELINE, street.typical)):
+                found = None if guess is None else depth_errors(guess, truth, CAP_M, street.crop)
+                if found is not None:
+                    errors[name].append(found)
+            done += 1
+        if not errors["networks"]:
+            raise DataError(f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with")
+        for name, found_all in errors.items():
+            each[name].append(found_all)
+    rows = [_depth_row(name, found, any(leaks)) for name, found in each.items() if all(found)]
+    if len(streets) > 1:
+        singles = zip(streets, each["networks"], leaks)
+        rows += [_depth_row("networks", [found], leak) | {"street": street.name} for street, found, leak in singles]
+    return rows
 
 
 def pose_protocol(
@@ -152,20 +159,19 @@ def windows(networks: PoseDepthNetworks, recording: Recording) -> Iterator[list[
             yield list(images)
 
 
-def _median_map(truths: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Per-pixel median of the true depth, the sky at the cap; every map has the first one's size."""
-    stacked = np.stack([np.where((t > 0) & (t < CAP_M), t, np.nan) for t in truths])
-    known = np.isfinite(stacked).any(axis=0)
-    median = np.full(stacked.shape[1:], CAP_M, dtype=np.float32)
-    median[known] = np.nanmedian(stacked[:, known], axis=0)
-    return median
-
-
-def _depth_row(name: str, errors: list[DepthErrors], leak: bool) -> dict[str, Any]:
-    mean = mean_errors(errors).as_dict()
-    scales = np.array([e.scale for e in errors])
-    spread = float(scales.std() / scales.mean())
-    return {"method": name, **mean, "scale_spread": spread, "images": len(errors), "leak": leak}
+def _depth_row(method: str, streets: list[list[DepthErrors]], leak: bool) -> dict[str, Any]:
+    """Means over streets of the means over their frames."""
+    mean = mean_errors([mean_errors(errors) for errors in streets]).as_dict()
+    scales = np.array([each.scale for errors in streets for each in errors])
+    parts = [block_error([each.abs_rel for each in errors]) for errors in streets]
+    known = [part for part in parts if part is not None]
+    row: dict[str, Any] = {"method": method, **mean, "abs_rel_se": None}
+    if len(known) == len(parts):
+        row["abs_rel_se"] = float(np.linalg.norm(known)) / len(parts)
+    else:
+        row["abs_rel_se_reason"] = f"a street has fewer than {2 * BLOCK} images"
+    row["scale_spread"] = float(scales.std() / scales.mean())
+    return row | {"images": len(scales), "streets": len(streets), "leak": leak}
 
 
 def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: bool) -> bool:

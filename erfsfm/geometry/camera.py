@@ -7,6 +7,7 @@ Pixel (0, 0) is the centre of the top-left pixel, so a resize by s moves the pri
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -25,6 +26,16 @@ class Camera(Pinhole):
     def K(self) -> NDArray[np.float32]:
         """The camera matrix ``(3, 3)``, pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float32)
+
+    def resized(self, width: int, height: int, fidelity: Fidelity = "default") -> Self:
+        """The camera of the resized image: ``c' = (c + 0.5) s - 0.5`` (the paper's code has ``c s``)."""
+        if fidelity == "default":
+            return super().resized(width, height)
+        return replace(self.multiplied(width / self.width, height / self.height), width=width, height=height)
+
+    def multiplied(self, x: float, y: float) -> Self:
+        """The rows of the camera matrix times factors, as the paper's code enlarges images; the size stays."""
+        return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of the window whose top-left pixel is ``(left, top)``."""

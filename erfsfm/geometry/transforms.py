@@ -42,8 +42,8 @@ def pose_vector_to_matrix(pose_vec_trans_euler: Tensor) -> Tensor:
     """
     translation, euler = pose_vec_trans_euler[..., :3], pose_vec_trans_euler[..., 3:]
     top = torch.cat([euler_to_rotation(euler), translation.unsqueeze(-1)], dim=-1)  # (..., 3, 4)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], dim=-2)
+    none = torch.zeros_like(top[..., :1, :])
+    return torch.cat([top, torch.cat([none[..., :3], none[..., 3:] + 1], dim=-1)], dim=-2)
 
 
 def transform_points(T_a_b: Tensor, points_b: Tensor) -> Tensor:

@@ -40,13 +40,14 @@ def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> Pr
     points_source = transform_points(T_source_target, backproject(depth, K))  # (B, 3, H*W)
     z = points_source[:, 2:]
     pixels = (K @ points_source)[:, :2] / z.clamp(min=MINIMUM_Z)  # (B, 2, H*W)
-    size = pixels.new_tensor([max(width - 1, 1), max(height - 1, 1)]).reshape(1, 2, 1)
-    normalised = 2 * pixels / size - 1
-    # half a thousandth of a pixel of slack: round-off must not cut the border off an identity warp
-    slack = 1 + 1e-3 / size
-    inside = (normalised.abs() <= slack).all(dim=1, keepdim=True) & (z > MINIMUM_Z)
+    extents = max(width - 1, 1), max(height - 1, 1)
+    axes = [2 * pixels[:, k : k + 1] / extent - 1 for k, extent in enumerate(extents)]  # (B, 1, H*W) each
+    inside = z > MINIMUM_Z
+    for axis, extent in zip(axes, extents):
+        # half a thousandth of a pixel of slack: round-off must not cut the border off an identity warp
+        inside = inside & (axis.abs() <= 1 + 1e-3 / extent)
     return Projection(
-        grid=normalised.reshape(batch, 2, height, width).permute(0, 2, 3, 1),
+        grid=torch.cat(axes, dim=1).reshape(batch, 2, height, width).permute(0, 2, 3, 1),
         valid=inside.reshape(batch, 1, height, width),
     )
 

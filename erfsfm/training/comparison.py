@@ -10,6 +10,7 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.snippets import split_recordings
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.training.output_folder import MEASUREMENTS
 
 _LEFT_OUT = ("method", "leak")  # the same in all rows
 
@@ -29,7 +30,7 @@ def depth_before_and_after(
         DataError, TrainingError: no depth could be measured there.
     """
     _, validation = split_recordings(config.data)
-    cache, rows = config.teacher.cache or output / "teacher", []
+    cache, rows = config.teacher.cache or output / MEASUREMENTS, []
     for when, weights in (("before", str(config.initial_weights)), ("after", str(output))):
         networks = DepthPosePredictor.from_weights(weights, device)
         errors = many_view_errors(networks, validation, cache, True, progress)

@@ -9,7 +9,8 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, EarlyStopping
+from lightning.pytorch.callbacks import Callback, EarlyStopping, WeightAveraging
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 import erfsfm
 from erfsfm.checkpoint import KINDS, Absent, Model, save_model
@@ -22,6 +23,26 @@ from erfsfm.training.module import DECISIVE, SelfSupervision, decisive
 logger = logging.getLogger(__name__)
 
 
+class Average(WeightAveraging):
+    """Moving average of the weights; in validations, until every callback before this one has seen their end, and after
+    the training the module has it for its own weights."""
+
+    def __init__(self, decay: float, device: str) -> None:
+        super().__init__(torch.device(device), multi_avg_fn=get_ema_multi_avg_fn(decay))
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Leave the average in the module."""
+
+    def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Give the module its own weights back."""
+        super().on_validation_epoch_end(trainer, module)
+
+    def end_early(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Give the module the average in the midst of a training, which is not to go on."""
+        if self._average_model is not None and not trainer.validating:
+            self._copy_average_to_current(module)
+
+
 class WeightKeeper(Callback):
     """Writes weights folders: the latest, the best, and those with the best poses.
 
@@ -30,8 +51,17 @@ class WeightKeeper(Callback):
     before a resume, and holds the latest weights as long as nothing was measured.
     """
 
-    def __init__(self, output: Path, seen: list[str], command: str, validates: bool, networks: TrainedNetworks) -> None:
+    def __init__(
+        self,
+        output: Path,
+        seen: list[str],
+        command: str,
+        validates: bool,
+        networks: TrainedNetworks,
+        average: Average | None = None,
+    ) -> None:
         self._output = output
+        self.average = average
         self._seen = seen
         self._command = command
         self.validates = validates
@@ -59,6 +89,8 @@ class WeightKeeper(Callback):
     ) -> None:
         """Keep the weights so far, if they are finite."""
         assert isinstance(module, SelfSupervision)
+        if self.average is not None:
+            self.average.end_early(trainer, module)
         if trainer.is_global_zero and trainer.global_step > 0 and _all_finite(module):
             save_model(self._output / "last", self._model(module, trainer.global_step))
 

@@ -24,7 +24,7 @@ from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
 from erfsfm.networks.presets import NetworkKind
 from erfsfm.training.muon import Muon, is_matrix
-from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_network_range
+from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -51,6 +51,7 @@ class SelfSupervision(lightning.LightningModule):
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self._choose_trained()
         self.train()  # Lightning keeps the mode of each module
+        self.loss = math.nan  # of the latest step
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
         self._constant_steps = 0
@@ -83,34 +84,38 @@ class SelfSupervision(lightning.LightningModule):
                 encoder.take_imagenet()
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
-        """The loss of one batch; stops the run where it is not finite, or the depth stays a constant.
-
-        Raises:
-            TrainingError: the loss is not finite, or the depth has been constant for many steps.
-        """
+        """The loss of one batch; `on_after_backward` stops the run where it is not finite or the depth a constant."""
         bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
         snippets = SnippetBatch(
             batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
         )
         result = evaluate_objective(self.depth_net, self.pose_net, snippets, self._config_of_step())
-        if not torch.isfinite(result.total):
-            parts = ", ".join(f"{name} {value.item():.3g}" for name, value in result.terms.items())
+        self._terms = {name: value.detach() for name, value in result.terms.items()}
+        self._watched = torch.stack([result.total.detach(), _spread(result)])
+        self.log("loss", self._watched[0])
+        self.log_dict({f"loss/{name}": value for name, value in self._terms.items()})
+        if result.disparities and self.global_step % (20 * self.config.training.log_every) == 0:
+            self._log_pictures(snippets, result.disparities[0], result.warped)
+        return result.total
+
+    def on_after_backward(self) -> None:
+        """Read loss and spread of the depth, means over all processes, in one wait for the device.
+
+        Raises:
+            TrainingError: the loss is not finite, or the depth has been constant for many steps.
+        """
+        self.loss, spread = self.trainer.strategy.reduce(self._watched, reduce_op="mean").tolist()
+        if not math.isfinite(self.loss):
+            parts = ", ".join(f"{name} {value.item():.3g}" for name, value in self._terms.items())
             raise TrainingError(
                 f"the loss at step {self.global_step} is not finite ({parts}): lower training.learning_rate or set "
                 "training.gradient_clip, then continue with --resume, or start again where the last checkpoint is bad "
                 "already; the weights so far are in last/"
             )
-        if result.disparities:
-            self._refuse_constant(result.disparities[0].detach())
-        self.log("loss", result.total.detach())
-        self.log_dict({f"loss/{name}": value.detach() for name, value in result.terms.items()})
-        if result.disparities and self.global_step % (20 * self.config.training.log_every) == 0:
-            self._log_pictures(snippets, result.disparities[0], result.warped)
-        return result.total
+        self._refuse_constant(spread)
 
-    def _refuse_constant(self, disparity: Tensor) -> None:
-        """Stop once the disparity ``(B, 1, H, W)`` has been constant in all images for `_CONSTANT_STEPS` steps."""
-        spread = float((disparity.std(dim=(1, 2, 3)) / disparity.mean(dim=(1, 2, 3))).max())
+    def _refuse_constant(self, spread: float) -> None:
+        """Stop once the disparity has been constant in all images for `_CONSTANT_STEPS` steps."""
         self._constant_steps = self._constant_steps + 1 if spread < _CONSTANT else 0
         if self._constant_steps == _CONSTANT_STEPS:
             raise TrainingError(
@@ -257,6 +262,14 @@ class SelfSupervision(lightning.LightningModule):
                 if warped is not None:
                     board.add_image("source warped", warped[0, len(warped[0]) // 2].clamp(0, 1), self.global_step)
                 board.add_image("disparity", shown, self.global_step)
+
+
+def _spread(result: ObjectiveResult) -> Tensor:
+    """Largest spread of the disparity in an image, standard deviation over mean; infinite without depth."""
+    if not result.disparities:
+        return result.total.new_full((), torch.inf)
+    disparity = result.disparities[0].detach()
+    return (disparity.std(dim=(1, 2, 3)) / disparity.mean(dim=(1, 2, 3))).amax()
 
 
 def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> float:

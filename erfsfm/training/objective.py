@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -94,7 +95,9 @@ def evaluate_objective(
         config: its ``loss``, ``network`` and ``teacher`` sections are used.
     """
     prediction = _Prediction.of(depth_net, pose_net, batch, config)
-    with torch.autocast(batch.target.device.type, enabled=False):
+    device = batch.target.device.type
+    has_autocast = torch.amp.is_autocast_available(device)  # `meta` has none
+    with torch.autocast(device, enabled=False) if has_autocast else nullcontext():
         return _evaluate(prediction, batch, config)
 
 
@@ -175,6 +178,8 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
             mask = prediction.masks[level] if prediction.masks is not None else None
             photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
             finest = warped.reshape(batch.sources.shape) if level == 0 else finest
+    if config.network.fidelity == "paper":
+        photometric = 2 * photometric  # the reference compares images in [-1, 1]
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if prediction.masks is not None and loss.mask_weight > 0:

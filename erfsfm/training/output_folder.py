@@ -13,6 +13,7 @@ from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 
 CONFIG = "config.yaml"
+MEASUREMENTS = "teacher"  # measured before a run begins, and kept if it is interrupted there
 # what a damaged checkpoint makes torch.load raise besides
 _OTHERS = (TypeError, AttributeError, OSError, struct.error)
 _BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # left by a run that failed before its first weights
@@ -37,7 +38,7 @@ class OutputFolder:
             raise TrainingError(f"--output {self.path} is a file, not a folder: choose another --output")
         if self.checkpoint.is_file() or (self.path / "model.yaml").is_file():
             raise TrainingError(f"{self.path} holds a run already: continue with --resume or choose another --output")
-        names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name}
+        names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name} - {MEASUREMENTS}
         foreign = sorted(names - _BEGUN)
         if not foreign and names and not self._has_our_config():
             foreign = [CONFIG if CONFIG in names else min(names)]

@@ -151,7 +151,8 @@ def _readable_parts(recordings: Sequence[Recording], network: NetworkConfig) -> 
 
 def _described(recording: Recording, config: ExperimentConfig) -> dict[str, Any]:
     """What the index says of a recording in either form."""
-    camera = PackedCamera(**vars(recording.camera.resized(config.network.width, config.network.height)))
+    network = config.network
+    camera = PackedCamera(**vars(recording.camera.resized(network.width, network.height, network.fidelity)))
     return {"name": recording.name, "start": recording.start, "frames": len(recording), "camera": camera}
 
 

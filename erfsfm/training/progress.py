@@ -10,6 +10,7 @@ import lightning
 from lightning.pytorch.callbacks import Callback
 
 from erfsfm.common.progress import Progress
+from erfsfm.training.module import SelfSupervision
 
 logger = logging.getLogger(__name__)
 
@@ -28,14 +29,14 @@ class StepProgress(Callback):
         if trainer.is_global_zero:
             self._progress("steps", trainer.global_step, trainer.max_steps)
 
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Tell of a step; reading the loss waits for the device."""
+    def on_train_batch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any) -> None:
+        """Tell of a step."""
+        assert isinstance(module, SelfSupervision)
         if not trainer.is_global_zero:
             return
-        loss = float(trainer.callback_metrics["loss"])
         step, steps, now_s = trainer.global_step, trainer.max_steps, time.monotonic()
         first, began_s = self._began = self._began or (step, now_s)
         if step - first == min(_TIMED_STEPS, steps - first) > 0:
             took_s = (now_s - began_s) / (step - first)
             logger.info("a step takes %.2g s, all %d steps take %.2g min", took_s, steps, steps * took_s / 60)
-        self._progress(f"steps, loss {loss:.4g}", step, steps)
+        self._progress(f"steps, loss {module.loss:.4g}", step, steps)

@@ -38,11 +38,12 @@ from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
-from erfsfm.training.keeper import Patience, WeightKeeper
+from erfsfm.training.keeper import Average, Patience, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
-from erfsfm.training.output_folder import OutputFolder
+from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
 from erfsfm.training.progress import StepProgress
+from erfsfm.training.reach import without_gradient
 from erfsfm.training.supervision import measured_views
 
 logger = logging.getLogger(__name__)
@@ -94,7 +95,7 @@ def train(
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before])
-    keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks)
+    keeper = _keeper(config.training, output, seen, command, bool(validation), device)
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
     loader = _loader(draws, config, device)
@@ -142,6 +143,14 @@ def _timer(minutes: float) -> Timer:
     return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
 
 
+def _keeper(
+    training: TrainingConfig, output: Path, seen: list[str], command: str, validates: bool, device: str
+) -> WeightKeeper:
+    decay = training.average_decay
+    average = Average(decay, choose_device(device)) if decay > 0 else None
+    return WeightKeeper(output, seen, command, validates, training.networks, average)
+
+
 def _draws(
     training: list[Recording],
     sharded: bool,
@@ -158,9 +167,9 @@ def _draws(
         raise ConfigError("data.exact needs worlds as files, not in shards: set data.exact=0, or name the worlds")
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
-    folder = config.teacher.cache or output / "teacher"
+    folder = config.teacher.cache or output / MEASUREMENTS
     _, measured = by_label(training, config.data)
-    many_views = measured_views(measured, config, folder, progress if rank == 0 else silent)
+    many_views = measured_views(measured, config, folder, progress)
     return SnippetDraws(training, config, draws, done, rank, many_views)
 
 
@@ -267,13 +276,13 @@ def _trainer(
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
     stops = [Patience(training.patience)] if training.patience else []
+    average = [callbacks[0].average] if callbacks[0].average else []
     several = training.processes > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
         devices=training.devices,
         num_nodes=training.nodes,
-        # loss terms and scales that are off leave weights without gradient
-        strategy=DDPStrategy(find_unused_parameters=True) if several else "auto",
+        strategy=DDPStrategy(find_unused_parameters=bool(without_gradient(config))) if several else "auto",
         sync_batchnorm=several and not on_cpu,
         use_distributed_sampler=False,  # each process has its own draws, and all validate everything
         precision=precision,
@@ -284,7 +293,7 @@ def _trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, *callbacks, *stops],
+        callbacks=[latest, *callbacks, *stops, *average],
         plugins=[AtomicCheckpoints()],
         enable_progress_bar=False,
         enable_model_summary=False,

@@ -6,7 +6,7 @@ run's trajectories for figures.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import RunError
 from slam.runtime.run_files import REFERENCE
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -60,6 +61,18 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
         fit = se3.Similarity(scale, np.eye(3), np.zeros(3))
         drawn["network"] = replace(drawn["network"], T_world_camera=fit.apply_to_poses(drawn["network"].T_world_camera))
     return drawn
+
+
+def paired(trajectories: Mapping[str, Trajectory]) -> Iterator[tuple[str, Trajectory, Trajectory]]:
+    """Name, aligned estimate and truth, row by row, of every estimate.
+
+    Raises:
+        RunError: there is no reference.
+    """
+    if REFERENCE not in trajectories:
+        raise RunError("errors and drift need ground truth, and this run has no reference")
+    for name, trajectory in estimates(aligned(trajectories)):
+        yield name, *associate(trajectory, trajectories[REFERENCE])
 
 
 def segment_errors(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.frames import Ends, RelativePose
+from slam.frames import Ends, RelativePose, runs
 from slam.frontend.drive import Drive
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
@@ -30,13 +30,13 @@ _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
 _FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens bias it
 # of good drives (docs/reliability.md): mean and spread
-_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
+USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
-_FAR_SPREAD, _FAR_CORNERS = 0.15, 0.05  # of the logarithm; and least corners over the most of a distance
-_CONTRADICTED_SPREAD = 0.007
+_FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners over the most of a distance
+_CONTRADICTED_SPREAD, _MOST_NAMED = 0.007, 10
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
-_SIGMAS, _CONFIDENCE = (1.0, 2.0, 3.0, 5.0), (0.97, 0.8, 0.4, 0.1)
+_SIGMAS, _CONFIDENCE = (1.0, 1.5, 2.0, 3.0, 5.0), (0.97, 0.85, 0.5, 0.2, 0.05)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
 
 
 def of_images(
-    drive: Drive, odometry: OdometryState, support: FloatArray, contradicted: int, needs_road: bool
+    drive: Drive, odometry: OdometryState, support: FloatArray, contradicted: Sequence[Ends], needs_road: bool
 ) -> list[Agreement]:
     """How far the images of a completed drive are from those of good drives, in the log too.
 
@@ -115,7 +115,7 @@ def of_images(
         drive: all its measurements.
         odometry: what its corners say of the camera and of learned depth.
         support: of the frames ``(N,)``, by `frame_support`.
-        contradicted: number of steps whose length learned depth or the speed before contradicts.
+        contradicted: steps whose length learned depth or the speed before contradicts.
         needs_road: whether lengths are measured on the road.
     """
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
@@ -124,8 +124,8 @@ def of_images(
     figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
     found = [("gaps", gaps, figure)]
     if steps:
-        figure = f"learned depth or the speed before contradict {contradicted} of {steps}"
-        found.append(("lengths of steps", contradicted / steps / _CONTRADICTED_SPREAD, figure))
+        figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}{_ends_of(contradicted)}"
+        found.append(("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure))
     if drive.motions or drive.failures or drive.map_poses.segments:  # else nothing was asked of the corners
         figure = f"{100 * mean:.0f} % of the corners fit in the next image"
         found.append(("the overlap of images", float(_support_sigmas(mean)), figure))
@@ -146,10 +146,16 @@ def of_images(
     return [each.said() for each in agreements]
 
 
+def _ends_of(steps: Sequence[Ends]) -> str:
+    stretches = runs([last for _, last in steps])
+    named = [f"{first} to {last}" if last > first else str(first) for first, last in stretches[:_MOST_NAMED]]
+    return f", which end at frames {', '.join(named)}{', ...' * (len(stretches) > _MOST_NAMED)}" if named else ""
+
+
 def frame_support(frames: int, motions: Sequence[Motion], located: Collection[int]) -> FloatArray:
     """The support of the motion to each frame ``(N,)``, 0 without one; frames ``located`` in a map have the usual."""
     support = np.zeros(frames)
-    support[list(located)] = _SUPPORT
+    support[list(located)] = USUAL_SUPPORT
     for motion in motions:
         support[motion.ends[1]] = max(support[motion.ends[1]], motion.support)
     support[:1] = support[1:2]
@@ -167,4 +173,4 @@ def confidence_of_frames(support: FloatArray) -> FloatArray:
 
 
 def _support_sigmas(support: FloatArray | float) -> FloatArray:
-    return np.maximum((_SUPPORT - np.asarray(support)) / _SUPPORT_SPREAD, 0.0)
+    return np.maximum((USUAL_SUPPORT - np.asarray(support)) / _SUPPORT_SPREAD, 0.0)

@@ -37,7 +37,6 @@ from slam.runtime.storage.spill import SpilledArray, SpillFile
 T = TypeVar("T")
 
 DOUBLED = "the image repeats the one before while the camera moves"
-_EXAMPLES, _MOST_EXAMPLES = 5, 8
 
 
 @dataclass(frozen=True)
@@ -72,35 +71,6 @@ class Keyframe:
         return self.spilled_depth.read()
 
 
-class Examples:
-    """Chooses frames to keep whole for the report, evenly spread over a drive: the first with depth from each place on.
-
-    Of a recording there are five places, known before its first frame. Of a drive that grows, whose end nobody knows,
-    there is one in every stride, and the stride doubles where more than eight would be kept.
-    """
-
-    def __init__(self, recording: range | None = None) -> None:
-        """Choose among the frames of a recording; None is a drive that grows."""
-        self._stride = 1
-        self._places: list[int] | None = None
-        if recording is not None:
-            spread = np.linspace(recording.start, recording.stop - 1, _EXAMPLES + 2).round().astype(int)
-            self._places = spread[1:-1].tolist() if recording else []
-
-    def offer(self, frame: Frame, depth: DepthMap, kept: list[tuple[int, Image, DepthMap]]) -> None:
-        """Add the next frame with depth ``(H, W)`` to those that are kept, if it is chosen."""
-        last, index = kept[-1][0] if kept else -1, frame.index
-        if self._places is None:
-            is_chosen = index // self._stride > last // self._stride
-        else:
-            is_chosen = any(last < place <= index for place in self._places)
-        if is_chosen:
-            kept.append((index, frame.image, depth))
-        if self._places is None and len(kept) > _MOST_EXAMPLES:
-            self._stride *= 2
-            kept[:] = kept[::2]
-
-
 @dataclass
 class Drive:
     """Measurements of a drive in the networks' unit of length.
@@ -126,7 +96,6 @@ class Drive:
     roads: list[GroundPlane | MeasurementFailure] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
-    examples: list[tuple[int, Image, DepthMap]] = field(default_factory=list)
     unusable: dict[int, str] = field(default_factory=dict)
     repeated: list[int] = field(default_factory=list)
     moving: list[int] = field(default_factory=list)
@@ -218,7 +187,7 @@ class Drive:
 
 _COLLECTED = (
     *("snippets", "motions", "road_steps", "relative_rotations", "failures", "roads"),
-    *("views", "keyframes", "examples", "unusable", "repeated", "moving"),
+    *("views", "keyframes", "unusable", "repeated", "moving"),
 )
 
 _Between = TypeVar("_Between", RelativePose, RelativeRotation)

@@ -29,9 +29,10 @@ _LARGEST_COPY = 2.0
 _EXPOSURE_STEP = 0.1
 _BLANK_CONTRAST = 3.0  # standard deviation of grey levels below which a frame is blank
 _NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below which a frame is noise
-# pixels stand whose grey level changes by less in the mean, and that of half of the others by four times as much
-_STANDING_GREY = 1.0
-_STANDING_IMAGES, _REMEMBERED_IMAGES = 10, 50
+# pixels stand whose grey level changes by less in the mean, and that of half of the image by much more
+_STANDING_GREY, _MOVING_GREY = 0.7, 4.0
+_BRIGHT_GREY = 235.0  # the sky does not change where the camera sees white
+_STANDING_IMAGES, _REMEMBERED_IMAGES = 20, 50
 _REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
 
 Verdict = Literal["new", "repeated"] | MeasurementFailure
@@ -58,12 +59,12 @@ class GateState:
     moved: int = 0
     standing: Mask | None = None
 
-    def with_change(self, change: _Layer) -> GateState:
-        """The state after an image whose pixels ``(h, w)`` changed while the camera moved."""
+    def with_change(self, change: _Layer, shrunk: _Layer) -> GateState:
+        """The state after a ``shrunk`` image ``(h, w)`` whose pixels changed while the camera moved."""
         moved = self.moved + 1
         before = change if self.change is None else self.change
         mean = before + (change - before) / np.float32(min(moved, _REMEMBERED_IMAGES))
-        standing = _standing(mean) if moved % _STANDING_IMAGES == 0 else self.standing
+        standing = _standing(mean, shrunk) if moved % _STANDING_IMAGES == 0 else self.standing
         return replace(self, change=mean, moved=moved, standing=standing)
 
 
@@ -120,18 +121,19 @@ class ImageGate:
             return "repeated"
         self._state = replace(self._state, shrunk=shrunk, difference=difference)
         if self.was_moving:
-            self._state = self._state.with_change(np.abs(shrunk - before))
+            self._state = self._state.with_change(np.abs(shrunk - before), shrunk)
         return "new"
 
 
-def _standing(change: _Layer) -> Mask | None:
+def _standing(change: _Layer, shrunk: _Layer) -> Mask | None:
     """The pixels ``(h, w)`` that hardly change while most others do, in pieces of at least three by three.
 
     The pixels beside these belong to them: corners there are seen with a part of both.
     """
-    if np.median(change) < 4.0 * _STANDING_GREY:
+    if np.median(change) < _MOVING_GREY:
         return None
-    few, piece = (change < _STANDING_GREY).astype(np.uint8), np.ones((3, 3), np.uint8)
+    few = ((change < _STANDING_GREY) & (shrunk < _BRIGHT_GREY)).astype(np.uint8)
+    piece = np.ones((3, 3), np.uint8)
     pieces = cv2.dilate(cv2.morphologyEx(few, cv2.MORPH_OPEN, piece), piece)
     return pieces.astype(bool) if pieces.any() else None
 

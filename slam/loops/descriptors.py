@@ -39,13 +39,13 @@ class FeatureExtractor:
             height_unscaled: camera height in the same unit; where known, depths farther than
                 ``max_depth_heights`` of it are not trusted.
         """
-        pixels, descriptors = self._features(frame.grey)
+        pixels, descriptors = self.corners(frame.grey)
         z = nearest_depth(depth_unscaled, pixels)
         farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
         points = self._intrinsics.rays(pixels) * np.where(z < farthest, z, np.nan)[:, None]
         return View(frame.index, pixels, descriptors, points.astype(np.float32))
 
-    def _features(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
+    def corners(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
         found = self._orb.detect(grey, None)
         strongest = _strongest_per_cell(found, grey.shape, _MAX_FEATURES)

@@ -17,7 +17,7 @@ from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
-from slam.frontend.drive import Drive, Examples
+from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, lidar_steps
@@ -36,7 +36,7 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
-from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_contradicted_steps, warn_of_doubts
+from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_doubts
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.input_checks import require_possible
@@ -151,7 +151,7 @@ class SlamPipeline:
         scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
         support = agreement.frame_support(len(drive), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
-        of_images = agreement.of_images(drive, state.odometry, support, len(scale.contradicted), needs_road)
+        of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         if closure is None:
             with self._watch.stage("loops"):
@@ -207,7 +207,6 @@ class SlamPipeline:
         config = self._config
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
-        warn_of_contradicted_steps(scale)
         factors = make_factors(drive, scale, self._noise, config.pose_network, config.visual_odometry)
         T_odometry = chain_odometry(factors, T_network, scale)
         if self.mode in ("reference", "known", "gps"):
@@ -291,13 +290,11 @@ class SlamPipeline:
             logger.warning(
                 "the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first
             )
-        examples = Examples(None if frames is not None else range(first, total))
         observer = Observer(
             self._predictor,
             self._sequence.intrinsics,
             self._config,
             self._watch,
-            examples,
             self._seed,
             state,
             self._sequence.camera_height_m,

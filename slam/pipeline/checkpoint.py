@@ -71,7 +71,7 @@ class SessionCheckpoint:
     @classmethod
     def of(cls, sequence: FrameSequence, state: FrontEndState, weights_sha256: str) -> Self:
         """From the state of an observer after the last frame, without images."""
-        without_images = replace(state, drive=replace(state.drive, keyframes=[], examples=[]))
+        without_images = replace(state, drive=replace(state.drive, keyframes=[]))
         return cls(
             sequence.name,
             sequence.provenance(),

@@ -7,7 +7,6 @@ import logging
 from slam.frames import runs
 from slam.frontend.drive import DOUBLED, Drive
 from slam.frontend.image_gate import GateState
-from slam.frontend.scale.metric_scale import Scale
 
 logger = logging.getLogger(__name__)
 
@@ -15,6 +14,7 @@ _MOST_NAMED = 10
 # real drives with automatic exposure have 0.13 at ten frames a second and 0.51 at two
 _ROLLING_EXPOSURE = 0.6
 _LEAST_COMPARED = 30
+_LEAST_STANDING = 0.02  # of the image
 
 
 def warn_of_doubts(drive: Drive, gate: GateState) -> None:
@@ -37,7 +37,7 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
             gate.exposed,
             gate.compared,
         )
-    if gate.standing is not None:
+    if gate.standing is not None and gate.standing.mean() > _LEAST_STANDING:
         logger.warning(
             "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
             "road is taken from there",
@@ -53,21 +53,6 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
                 last,
                 first - 1,
             )
-
-
-def warn_of_contradicted_steps(scale: Scale) -> None:
-    """Warn of steps whose length learned depth or the speed around them contradicts."""
-    if not scale.contradicted:
-        return
-    stretches = runs([last for _, last in scale.contradicted])
-    named = ", ".join(f"{first} to {last}" if last > first else str(first) for first, last in stretches[:_MOST_NAMED])
-    logger.warning(
-        "the lengths of %d steps contradict learned depth or the speed before: frames may be missing, or the steps are "
-        "wrong; they end at frames %s%s",
-        len(scale.contradicted),
-        named,
-        ", ..." if len(stretches) > _MOST_NAMED else "",
-    )
 
 
 def _warn_of_segments(drive: Drive) -> None:

@@ -57,4 +57,4 @@ class Estimate:
     def places(self, intrinsics: Intrinsics) -> Places:
         """Every view with its points at the poses of the optimised trajectory, and the camera."""
         frames = np.array([view.index for view in self.views], dtype=np.intp)
-        return Places(intrinsics, tuple(self.views), self.optimised.select(frames).T_world_camera)
+        return Places(intrinsics, tuple(self.views), self.optimised.T_world_camera[frames])

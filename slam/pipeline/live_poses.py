@@ -9,6 +9,7 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
+from slam.frontend.agreement import USUAL_SUPPORT, confidence_of_frames
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.network_factors import chain_raw
@@ -22,12 +23,16 @@ State = Literal["starting", "tracking", "bridged", "relocalised"]
 
 @dataclass(frozen=True)
 class LivePose:
-    """A frame's pose ``(4, 4)``; ``unit`` is that of the pose over that of learned depth, None while unknown."""
+    """A frame's pose ``(4, 4)``; ``unit`` is that of the pose over that of learned depth, None while unknown.
+
+    ``confidence`` is that of the frame, by its corners (`confidence_of_frames`).
+    """
 
     frame: int
     T_world_camera: FloatArray
     state: State
     unit: float | None
+    confidence: float
 
 
 class LivePoses:
@@ -79,13 +84,14 @@ class LivePoses:
         """The frames that the observer has finished since the last call."""
         drive = observer.drive
         first, count = len(self._T_world_camera), len(drive)
-        for index in range(first, count):
-            self._step(observer, index)
+        support = np.array([self._step(observer, index) for index in range(first, count)])
         if drive.snippets and (self._unit is None or count // self._update > first // self._update):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        added = [(k, self._T_world_camera[k].copy(), self._state(k in drive.unusable)) for k in range(first, count)]
-        return [LivePose(*each, unit) for each in added]
+        return [
+            LivePose(k, self._T_world_camera[k].copy(), self._state(k in drive.unusable), unit, confidence)
+            for k, confidence in enumerate(confidence_of_frames(support).tolist(), first)
+        ]
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""
@@ -101,11 +107,11 @@ class LivePoses:
             return "starting"
         return "bridged" if is_bridged else "relocalised" if before else "tracking"
 
-    def _step(self, observer: Observer, index: int) -> None:
-        """Append the pose of a frame by its own step, or by the last one again."""
+    def _step(self, observer: Observer, index: int) -> float:
+        """Append the pose of a frame by its own step, or by the last one again; its support is returned."""
         if not index:
             self._T_world_camera.append(np.eye(4))
-            return
+            return USUAL_SUPPORT
         before, by_keyframes = index - 1, observer.keyframe_step(index)
         motion = next((m for m in reversed(observer.drive.motions[-4:]) if m.ends == (before, index)), None)
         T_before_frame = self._T_previous_newest
@@ -118,6 +124,7 @@ class LivePoses:
             T_before_frame[:3, 3] *= self._unit or 1.0
         self._T_world_camera.append(self._T_world_camera[before] @ T_before_frame)
         self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
+        return USUAL_SUPPORT if by_keyframes is not None else 0.0 if motion is None else motion.support
 
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor
-from slam.frontend.drive import Drive, Examples, Keyframe
+from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.image_gate import ImageGate, Verdict
@@ -53,7 +53,6 @@ class Observer:
         intrinsics: Intrinsics,
         config: SlamConfig,
         stopwatch: Stopwatch,
-        examples: Examples | None = None,
         seed: int = 0,
         state: FrontEndState | None = None,
         camera_height_m: float | None = None,
@@ -65,7 +64,6 @@ class Observer:
             intrinsics: of all images.
             config: of all parts.
             stopwatch: measures the time of stages.
-            examples: frames to keep whole for the report; None keeps none.
             seed: of all RANSAC draws.
             state: of an observer of the same predictor, camera and configuration.
             camera_height_m: above the road; None where unknown.
@@ -73,7 +71,6 @@ class Observer:
         self._predictor = predictor
         self._config = config
         self._stopwatch = stopwatch
-        self._examples = examples or Examples(range(0))
         self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate)
         self._odometry = VisualOdometry(
@@ -260,7 +257,6 @@ class Observer:
         if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
             with self._stopwatch.stage("loops"):
                 views.append(self._features.view(frame, depth, height))
-        self._examples.offer(frame, depth, self._drive.examples)
         self._keep(frame, depth)
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:

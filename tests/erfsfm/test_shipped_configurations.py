@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,9 +12,9 @@ import pytest
 import yaml
 
 from erfsfm.checkpoint import load_model
+from erfsfm.cli import main
 from erfsfm.config import load_experiment
 from erfsfm.model_record import SHIPPED
-from erfsfm.training.run import train
 
 NAMES = sorted(path.stem for path in (Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
 FRAMES = 12
@@ -47,7 +48,9 @@ def test_weights_have_the_name_of_the_configuration_that_trains_them(weights: st
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_starts(name: str, data: list[Path], measure: Callable[..., None], tmp_path: Path) -> None:
+def test_it_starts(
+    name: str, data: list[Path], measure: Callable[..., None], command_line: Callable[..., Any], tmp_path: Path
+) -> None:
     written = load_experiment(name)
     small = ["training.batch=2", "training.steps=1", "data.workers=0", "data.validation=[simulated/500]"]
     small += ["data.validation_share=0", "data.validation_snippets=1", "data.cache_mb=50"]
@@ -60,6 +63,11 @@ def test_it_starts(name: str, data: list[Path], measure: Callable[..., None], tm
     config = load_experiment(name, small).with_roots(data)
     if config.teacher.views == "many":
         measure(config, lambda *_: 0.25)
-    record = load_model(train(config, tmp_path / "run", device="cpu")).record
+    options = [word for root in data for word in ("--dataset", str(root))]
+    options += [word for change in small for word in ("--set", change)]
+    output = str(tmp_path / "run")
+    command = command_line(main, "erfsfm", "train", "--config", name, *options, "--output", output, "--device", "cpu")
+    assert command[:2] == (0, f"weights in {output}: use them with --weights {output}\n"), command
+    record = load_model(output).record
     assert record.step == 1
     assert record.network == config.network

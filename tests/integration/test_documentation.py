@@ -60,6 +60,8 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(erfsfm pack --config tiny .* --output) pack", r"\1 again"),  # the workspace has it, to train from
     (r"--split eigen", "--split my_frames.txt"),  # the 697 frames of Eigen are not here
     (r"^erfsfm receptive-field (?!.*--images).*", rf"\g<0> --width {WIDTH} --height {HEIGHT}"),
+    (r"--dataset ROOT --sequence (NAME|\d\d)", "--dataset KITTI --sequence 05"),
+    (r"--weights WEIGHTS", "--weights sim"),
     (r"--routes loop straight", "--routes straight"),
     (r"--routes loop", "--routes straight"),
     (r"--worlds( \d+)+", "--worlds 620"),

@@ -16,8 +16,10 @@ from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config.sections import SlamConfig, dump_yaml
 from slam.evaluation.double_walls import double_wall_share
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame
+from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
+from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
+from slam.mapping.filters import KeyframeDepth
 from slam.mapping.submap import remove_submaps
 from slam.mapping.surface import positions
 from slam.pipeline.batch import SlamPipeline
@@ -32,7 +34,9 @@ from slam.results.gps import write_places
 from slam.results.map_error import map_errors
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import write_map_views
-from slam.results.report.page import DepthExample, write_report
+from slam.results.report.page import write_report
+from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.report.rendering import Picture
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
 from slam.runtime.errors import EmptyMapError, RunError, SlamError
@@ -111,13 +115,20 @@ def _run(job: Job, folder: RunFolder) -> None:
     _write_estimate(folder, estimate, job)
     if checkpoints is not None:
         checkpoints.finish(estimate.state)
-    metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
+    with estimate.stopwatch.stage("evaluation"):
+        metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
     folder.publish()
     if stream is not None:
         stream.finish(estimate, folder.path)
-    quality = DepthQuality(job.recording, estimate.scale.is_metric)
-    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
+    quality, depths = DepthQuality(job.recording, estimate.scale.is_metric), DepthPictures(len(job.recording))
+
+    def compare(keyframe: KeyframeDepth) -> None:
+        depths.add(keyframe)
+        with estimate.stopwatch.stage("evaluation"):
+            quality.add(keyframe)
+
+    result = replace(estimate, map=job.pipeline.fuse(estimate, compare, folder.path))
     map_metrics = _write_map(folder, result, job)
     depth = quality.metrics(job.settings.depth.refine != "none")
     timing = timing_of(result.stopwatch, len(job.recording) - result.first)
@@ -126,11 +137,23 @@ def _run(job: Job, folder: RunFolder) -> None:
     job.progress("report", 0, 1)
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
-        examples = [DepthExample(i, image, depth) for i, image, depth in result.drive.examples]
-        write_report(folder, examples, views)
+        write_report(folder, depths.pictures(), _loop_pictures(result, job), views)
     job.progress("report", 1, 1)
     if job.rerun is not None:
         write_rerun(job.rerun, result, job.recording.intrinsics)
+
+
+def _loop_pictures(result: Estimate, job: Job) -> list[Picture]:
+    """Images of accepted loops: of the recording, or of the keyframes of a live drive."""
+
+    def image(index: int) -> Image | None:
+        try:
+            return job.recording.frame(index).image
+        except SlamError:
+            return next((each.image for each in result.drive.keyframes if each.index == index), None)
+
+    thresholds = OF_KEYFRAMES if result.drive.maps else LoopThresholds.of_frames(job.settings.loops)
+    return loop_pictures(result.loops.accepted, image, job.recording.intrinsics, thresholds)
 
 
 def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
@@ -177,9 +200,10 @@ def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
     with result.stopwatch.stage("mesh"):
         surface.write_mesh(folder.path / MAP_MESH)
         surface.write_cloud(folder.path / MAP_CLOUD)
-    share = double_wall_share(surface.meshes()) if result.scale.is_metric else Missing("lengths are not in metres")
+    with result.stopwatch.stage("evaluation"):
+        share = double_wall_share(surface.meshes()) if result.scale.is_metric else Missing("lengths are not in metres")
+        errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, job.recording)
     remove_submaps(folder.path / SUBMAPS)
-    errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, job.recording)
     job.progress("map files", 1, 1)
     return MapMetrics(**asdict(result.map.statistics()), double_wall_share=share, **dict(errors))
 
@@ -197,4 +221,4 @@ def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseExceptio
         if job.stream is not None and folder.trajectory("odometry") is None:
             folder.write_trajectory("odometry", job.stream.tracked())
         if job.settings.output.report:
-            write_report(folder, [], None)
+            write_report(folder)

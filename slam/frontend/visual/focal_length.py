@@ -18,7 +18,7 @@ from slam.geometry.se3 import FloatArray
 
 _STEP = 0.01  # of the logarithm, for its derivative
 _LEAST_SIGMA_PX = 1e-3
-_CORRELATION = 2.0  # of the errors of corners, as of their motion
+_CORRELATION = 4.0  # of the errors of corners, and of those that flow makes where a camera hardly turns
 
 
 @dataclass(frozen=True)

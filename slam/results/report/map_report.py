@@ -1,28 +1,22 @@
-"""The map in the report: its size, its error against the true surface, and the error over distance."""
+"""The map in the report: its size, and its error against the true surface, also by distance."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
 
 from slam.evaluation.map import Ring, SurfaceMetrics
 from slam.results.metrics import MapSizes, Metrics
-from slam.results.report.plots import figure_style
 from slam.results.report.tables import Cell, Table, notes_on, number
 from slam.runtime.storage.record import Missing, known
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 _Value = Callable[[SurfaceMetrics | Missing], float | Missing]
 _ERRORS: dict[str, _Value] = {
-    "accuracy, median (m)": lambda m: m.accuracy_median_m,
-    "accuracy, 90 % (m)": lambda m: m.accuracy_90_m,
-    "over 1 m": lambda m: m.outlier_share,
-    "completeness, 0.3 m": lambda m: m.completeness,
-    "F-score, 0.2 m": lambda m: m.f_score.m02,
-    "F-score, 0.5 m": lambda m: m.f_score.m05,
+    "accuracy, median\u00a0(m)": lambda m: m.accuracy_median_m,
+    "accuracy, 90\u00a0%\u00a0(m)": lambda m: m.accuracy_90_m,
+    "over 1\u00a0m": lambda m: m.outlier_share,
+    "completeness, 0.3\u00a0m": lambda m: m.completeness,
+    "F-score, 0.2\u00a0m": lambda m: m.f_score.m02,
+    "F-score, 0.5\u00a0m": lambda m: m.f_score.m05,
 }
 _FILTERS = {
     "unknown": "no depth",
@@ -55,7 +49,7 @@ def map_sizes(metrics: Metrics) -> Table | None:
         if isinstance(value, int) or name in ("points", "blocks")
     }
     missing = [f"{name}: {cell.tooltip}" for name, cell in cells.items() if cell.tooltip]
-    return Table(["", *cells], [[Cell("map"), *cells.values()]], notes=notes_on(missing))
+    return Table((), [[Cell(name), cell] for name, cell in cells.items()], "words", notes_on(missing))
 
 
 def map_filters(metrics: Metrics) -> Table | None:
@@ -75,7 +69,7 @@ def map_filters(metrics: Metrics) -> Table | None:
     ):
         if not isinstance(part, Missing):
             rows.append([Cell(name), Cell(f"{part:.1%}"), Cell(what)])
-    return Table(["filter", "share", "of the keyframes' pixels, one filter after another"], rows)
+    return Table(["filter", "share", "of the keyframes' pixels, one filter after another"], rows, "words")
 
 
 def map_errors_table(metrics: Metrics) -> Table | None:
@@ -99,43 +93,6 @@ def map_errors_table(metrics: Metrics) -> Table | None:
     words = f"Against {truth}, {length} m of road. Map where no surface was measured is an error."
     missing = (number(value(found)).tooltip for value in _ERRORS.values())
     return Table(["", *_ERRORS], rows, notes=[words, *notes_on(missing)])
-
-
-def map_error_figure(metrics: Metrics) -> Figure:
-    """Accuracy, completeness and F-scores over the distance from the nearest camera."""
-    rings = _rings(metrics)
-    with figure_style() as new_figure:
-        figure = new_figure(figsize=(7.4, 3.0), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        _draw(left, rings, "accuracy, median (m)", label="median", color="#0072b2", linestyle="-")
-        _draw(left, rings, "accuracy, 90 % (m)", label="90 %", color="#e69f00", linestyle="--")
-        left.set(xlabel="distance from the camera (m)", ylabel="distance to the true surface (m)", yscale="log")
-        left.yaxis.set_major_formatter("{x:g}")
-        for name, colour, line in (
-            ("completeness, 0.3 m", "#0072b2", "-"),
-            ("F-score, 0.5 m", "#e69f00", "--"),
-            ("F-score, 0.2 m", "#009e73", ":"),
-        ):
-            _draw(right, rings, name, label=name, color=colour, linestyle=line)
-        right.set(xlabel="distance from the camera (m)", ylim=(0.0, 1.02))
-        for axes in (left, right):
-            axes.set_xlim(left=0)
-            axes.legend()
-    return figure
-
-
-def has_map_curve(metrics: Metrics) -> bool:
-    """Whether the error of the map is known at two distances or more."""
-    return sum(not isinstance(ring.accuracy_median_m, Missing) for ring in _rings(metrics)) > 1
-
-
-def _draw(axes: Axes, rings: Sequence[Ring], name: str, **look: Any) -> None:
-    points = []
-    for ring in rings:
-        low, high, value = known(ring.from_m), known(ring.to_m), known(_ERRORS[name](ring))
-        if low is not None and high is not None and value is not None:
-            points.append((0.5 * (low + high), value))
-    axes.plot([middle for middle, _ in points], [value for _, value in points], marker="o", **look)
 
 
 def _row(name: str, errors: SurfaceMetrics | Missing) -> list[Cell]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 import json
 from dataclasses import dataclass
 from importlib.resources import files
@@ -17,7 +15,8 @@ from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.results.report.map_mesh import MapMesh, MapMeshFile
-from slam.results.report.plots import AerialView, length_unit, map_figure, png
+from slam.results.report.plots import AerialView, length_unit, map_figure
+from slam.results.report.rendering import packed
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_ABOVE, MAP_DRIVER, MAP_MESH
@@ -50,9 +49,9 @@ class MapViewer:
 
 @dataclass(frozen=True)
 class MapViews:
-    """The pictures as PNG: ``above``, and ``driver`` from the seat at ``frame``; the viewer, or None."""
+    """The map from ``above``, the picture of the ``driver`` at ``frame`` as PNG, and the viewer or None."""
 
-    above: bytes
+    above: AerialView
     driver: bytes
     frame: int
     viewer: MapViewer | None
@@ -74,7 +73,8 @@ def write_map_views(folder: RunFolder, triangles: int) -> MapViews | None:
     file = MapMeshFile(folder.path / MAP_MESH)
     mesh = file.reduced(_MOST_TRIANGLES)
     scene = MapScene(mesh)
-    figure = map_figure(scene.from_above(trajectory.positions), trajectory, length_unit(folder))
+    above = scene.from_above(trajectory.positions)
+    figure = map_figure(above, trajectory, length_unit(folder))
     T_world_camera = trajectory.T_world_camera
     frame = scene.best_seat(T_world_camera)
     if file.triangles > _MOST_TRIANGLES:  # the driver sees the mesh as it is
@@ -82,8 +82,8 @@ def write_map_views(folder: RunFolder, triangles: int) -> MapViews | None:
         scene = MapScene(near) if len(near.triangles) else scene
     driver = scene.from_seat(T_world_camera[frame])
     viewer = map_viewer(mesh.decimated(triangles), T_world_camera, frame) if triangles else None
-    views = MapViews(png(figure), _png(driver), frame, viewer)
-    folder.write(MAP_ABOVE, lambda path: path.write_bytes(views.above))
+    views = MapViews(above, _png(driver), frame, viewer)
+    folder.write(MAP_ABOVE, lambda path: figure.savefig(path, format="png", dpi=160, metadata={"Software": None}))
     folder.write(MAP_DRIVER, lambda path: path.write_bytes(views.driver))
     return views
 
@@ -192,7 +192,7 @@ def map_viewer(mesh: MapMesh, T_world_camera: FloatArray, seat: int) -> MapViewe
         "background": "#" + bytes(BACKGROUND).hex(),
     }
     script, three = (files("slam.results.report") / "viewer" / name for name in ("viewer.js", "three.min.js"))
-    return MapViewer(json.dumps(about), _packed(content), _packed(three.read_bytes()), script.read_text("utf-8"))
+    return MapViewer(json.dumps(about), packed(content), packed(three.read_bytes()), script.read_text("utf-8"))
 
 
 def _by_first_use(mesh: MapMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +203,3 @@ def _by_first_use(mesh: MapMesh) -> tuple[np.ndarray, np.ndarray]:
     number = np.empty(len(used), dtype=np.int64)
     number[order] = np.arange(len(used))
     return used[order], number[inverse].reshape(-1, 3)
-
-
-def _packed(content: bytes) -> str:
-    return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")

@@ -1,111 +1,81 @@
-"""The report of a run: one self-contained page with its inputs, errors and figures."""
+"""The report of a run: one self-contained page with a verdict, its inputs, errors and figures."""
 
 from __future__ import annotations
 
-import base64
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from slam.formats.trajectory import Trajectory
-from slam.frames import DepthMap, Image
 from slam.results.folder import RunFolder
-from slam.results.metrics import Metrics
+from slam.results.metrics import LoopsFile, Metrics
 from slam.results.report import tables as report_tables
-from slam.results.report.map_report import has_map_curve, map_error_figure, map_errors_table, map_filters, map_sizes
+from slam.results.report.map_report import map_errors_table, map_filters, map_sizes
 from slam.results.report.map_view import MapViews
-from slam.results.report.plots import (
-    depth_figure,
-    length_unit,
-    png,
-    trajectories_figure,
-    trajectories_of,
-)
+from slam.results.report.plots import length_unit, trajectories_of
+from slam.results.report.rendering import Picture, render
 from slam.results.report.tables import Cell, Table, number
-from slam.runtime.errors import SlamError
+from slam.results.report.verdict import verdict
+from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import LOOPS, MEANINGS, REFERENCE, REPORT
 from slam.runtime.storage.record import MISSING, Missing, known
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from plotly.graph_objects import Figure
 
 logger = logging.getLogger(__name__)
 
-_TEMPLATES = Environment(
-    loader=PackageLoader("slam", "results/report"),
-    autoescape=True,
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-    keep_trailing_newline=True,
+_ALIGNED = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
+_AS_WRITTEN = "As written; no ground truth is known. The raw network chain is scaled to the rest."
+_NOISE = (
+    "Share of factors whose error at the truth lies inside a bound of their stated noise; dashed is what the bound "
+    "promises. Less means sigmas that are too small, more means sigmas that are too large."
 )
-
-
-@dataclass(frozen=True, eq=False)
-class DepthExample:
-    """A frame with its learned depth: ``image`` ``(H, W, 3)`` uint8 RGB, ``depth`` ``(H, W)``, any unit."""
-
-    index: int
-    image: Image
-    depth: DepthMap
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure as a base64 PNG, or why it could not be drawn."""
-
-    title: str
-    caption: str
-    data: str = ""
-    reason: str = ""
 
 
 def write_report(
     folder: RunFolder,
-    examples: Sequence[DepthExample],
-    views: MapViews | None,
+    depths: Sequence[Picture] = (),
+    loops: Sequence[Picture] = (),
+    views: MapViews | None = None,
 ) -> None:
     """Write ``report.html`` from the files of a folder; also for a failed run.
 
     Args:
         folder: the run, with its ``metrics.json`` and trajectories written.
-        examples: frames to show with their depth.
+        depths: strips of images and their depth.
+        loops: pairs of images of accepted loops.
         views: of the map, or None without one.
 
     Raises:
         RunError: ``metrics.json`` is damaged.
     """
-    metrics = folder.metrics()
-    name = known(metrics.sequence.name) or folder.path.resolve().name
-    trajectories, unit = _trajectories(folder), length_unit(folder)
-    page = _TEMPLATES.get_template("page.html.j2").render(
-        name=name,
+    metrics, loops_file = folder.metrics(), _loops_file(folder)
+    page = render(
+        "page.html.j2",
+        name=known(metrics.sequence.name) or folder.path.resolve().name,
         failure=metrics.failure,
+        verdict=verdict(metrics),
         leak=metrics.provenance.leak is True,
         version=known(metrics.provenance.version) or "",
         unit_notes=metrics.unit_notes(),
         key_numbers=[] if metrics.failure else report_tables.key_numbers(metrics),
         what_ran=report_tables.what_ran(metrics),
-        trajectories=_trajectory_picture(trajectories, unit),
+        plots=_plots(metrics, _trajectories(folder), length_unit(folder), loops_file, views),
         errors=report_tables.errors(metrics),
         gps=report_tables.gps(metrics),
         no_errors=report_tables.no_errors(metrics),
-        error_pictures=list(_error_pictures(trajectories)),
-        depth=_depth_picture(examples),
+        depths=depths,
         depth_error=_depth_error(metrics),
-        map_picture=_map_picture(views),
         driver=_driver_picture(views),
         viewer=None if views is None else views.viewer,
         map=map_sizes(metrics),
         map_filters=map_filters(metrics),
         map_errors=map_errors_table(metrics),
-        map_curve=_map_curve(metrics),
         no_map=_absence(metrics, metrics.map),
-        loops=report_tables.loops(metrics, folder.path / LOOPS),
+        loops=report_tables.loops(metrics, loops_file),
+        loop_pictures=loops,
         no_loops=_absence(metrics, metrics.loops),
         tracking=report_tables.tracking(metrics),
         graph=report_tables.graph(metrics),
@@ -116,6 +86,14 @@ def write_report(
     folder.write_text(REPORT, page)
 
 
+def _loops_file(folder: RunFolder) -> LoopsFile:
+    """``loops.json``; empty where the file is missing or damaged."""
+    try:
+        return LoopsFile.read(folder.path / LOOPS)
+    except (OSError, RunError):
+        return LoopsFile()
+
+
 def _absence(metrics: Metrics, part: object) -> str:
     """Why a run has no such part; empty where it has one, or failed before."""
     if not isinstance(part, Missing) or (metrics.failure and part == MISSING):
@@ -123,27 +101,46 @@ def _absence(metrics: Metrics, part: object) -> str:
     return part.reason
 
 
-def _trajectory_picture(trajectories: Mapping[str, Trajectory], unit: str) -> Picture | None:
-    if not trajectories:
-        return None
-    if REFERENCE in trajectories:
-        caption = (
-            "Seen from above. Each estimate is aligned to the ground truth by rotation, translation and one scale."
-        )
-    else:
-        caption = "Seen from above, as written; no ground truth is known. The raw network chain is scaled to the rest."
-    return _drawn(
-        lambda: trajectories_figure("trajectory", trajectories, unit=unit), "Trajectories from above", caption
-    )
+def _plots(
+    metrics: Metrics, trajectories: Mapping[str, Trajectory], unit: str, loops: LoopsFile, views: MapViews | None
+) -> dict[str, list[Picture]]:
+    """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
+    from slam.results.report import figures
 
+    found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": [], "noise": []}
 
-def _error_pictures(trajectories: Mapping[str, Trajectory]) -> Iterator[Picture]:
-    if REFERENCE not in trajectories or len(trajectories) < 2:
-        return
-    caption = "Distance to the true position, after the 7-dof alignment."
-    yield _drawn(lambda: trajectories_figure("errors", trajectories), "Position error over distance travelled", caption)
-    caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
-    yield _drawn(lambda: trajectories_figure("drift", trajectories), "Drift over segment length", caption)
+    def add(section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> None:
+        try:
+            found[section].append(Picture.of_plot(title, caption, draw(*given)))
+        except SlamError as error:
+            found[section].append(Picture(title, caption, reason=str(error)))
+
+    has_truth = REFERENCE in trajectories and len(trajectories) > 1
+    gaps, accepted = known(metrics.sequence.bridged) or [], known(loops.accepted) or []
+    if trajectories:
+        given = (trajectories, "m" if has_truth else unit, accepted)
+        caption = _ALIGNED if has_truth else _AS_WRITTEN
+        add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
+    if has_truth:
+        how = "as written, the network after the 7-dof alignment" if metrics.is_metric else "after the 7-dof alignment"
+        caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
+        title = "Scale and rotation over time"
+        add("trajectories", title, caption, figures.scale_figure, trajectories, metrics.is_metric, gaps)
+        caption = "Distance to the true position, after the 7-dof alignment."
+        add("errors", "Position error along the path", caption, figures.error_figure, trajectories)
+        caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
+        add("errors", "Drift by the length of segments", caption, figures.drift_figure, trajectories)
+    elif trajectories:
+        caption = "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
+        add("trajectories", "Speed and rotation over time", caption, figures.motion_figure, trajectories, unit, gaps)
+    if views is not None:
+        driven = {name: each for name, each in trajectories.items() if name == "optimised"}
+        caption = "The map from above in its own colours, with the optimised trajectory."
+        add("map", "Map from above", caption, figures.trajectories_figure, driven, unit, (), views.above)
+    if (coverage := known(metrics.graph.coverage)) is not None:
+        by_source = known(metrics.graph.coverage_by_source) or {}
+        add("noise", "Stated noise", _NOISE, figures.noise_figure, coverage, by_source)
+    return found
 
 
 def _depth_error(metrics: Metrics) -> Table | None:
@@ -164,33 +161,11 @@ def _signed(value: float | Missing) -> Cell:
     return number(value) if isinstance(value, Missing) else Cell(f"{value:+.2f}")
 
 
-def _depth_picture(examples: Sequence[DepthExample]) -> Picture | None:
-    if not examples:
-        return None
-    labels = [f"frame {example.index}" for example in examples]
-    caption = "Frames above their learned disparity: bright is near, dark is far, one colour scale for all."
-    images, depths = [example.image for example in examples], [example.depth for example in examples]
-    return _drawn(lambda: depth_figure(images, depths, labels), "Depth maps", caption)
-
-
-def _map_picture(views: MapViews | None) -> Picture | None:
-    if views is None:
-        return None
-    return Picture("Map from above", "The map from above in its own colours.", _encoded(views.above))
-
-
 def _driver_picture(views: MapViews | None) -> Picture | None:
     if views is None:
         return None
     caption = f"The map from the driver's seat at frame {views.frame}."
-    return Picture("Map from the driver's seat", caption, _encoded(views.driver))
-
-
-def _map_curve(metrics: Metrics) -> Picture | None:
-    if not has_map_curve(metrics):
-        return None
-    caption = "Error of the map by the distance of its points, and of the true surface, from the nearest camera."
-    return _drawn(lambda: map_error_figure(metrics), "Map error over distance", caption)
+    return Picture.of_file("Map from the driver's seat", caption, views.driver, "png")
 
 
 def _files(folder: RunFolder) -> Table | None:
@@ -210,18 +185,6 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
     except SlamError as error:
         logger.info("the report shows no trajectories: %s", error)
         return {}
-
-
-def _drawn(draw: Callable[[], Figure], title: str, caption: str) -> Picture:
-    """A picture, or why it cannot be drawn (for example, trajectories without common stamps)."""
-    try:
-        return Picture(title, caption, _encoded(png(draw())))
-    except SlamError as error:
-        return Picture(title, caption, reason=str(error))
-
-
-def _encoded(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")
 
 
 def _size(count: int) -> str:

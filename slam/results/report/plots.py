@@ -1,4 +1,4 @@
-"""Figures for a paper and for the report: trajectories, errors, drift, depth and the map from above.
+"""Figures for a paper: trajectories, errors, drift, and the map from above.
 
 Colours are those of Okabe and Ito (2008), distinct for colour-blind readers; line styles are distinct in
 grey. Matplotlib is imported inside the functions, without changes of its global state.
@@ -6,7 +6,6 @@ grey. Matplotlib is imported inside the functions, without changes of its global
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.figure_file import require_figure, save_figure
-from slam.evaluation.drift import aligned, estimates, segment_drifts
-from slam.formats.trajectory import Trajectory, associate
-from slam.frames import DepthMap, Image
+from slam.evaluation.drift import aligned, paired, segment_drifts
+from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import path_distance
 from slam.results.folder import RunFolder
 from slam.results.metrics import METRES
@@ -46,38 +44,16 @@ _STYLE = {
     "pdf.fonttype": 42,
     "svg.hashsalt": "erfsfm-slam",
 }
-_LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
+LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE: ("Ground truth", {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.2, "zorder": 4}),
     "network": ("Network, chained", {"color": "#e69f00", "linestyle": "-", "linewidth": 1.3}),
     "odometry": ("Odometry", {"color": "#cc79a7", "linestyle": (0, (6, 1.5, 1, 1.5)), "linewidth": 1.5}),
     "optimised": ("Optimised", {"color": "#0072b2", "linestyle": "-", "linewidth": 2.0}),
     "lidar": ("LiDAR (KISS-ICP)", {"color": "#009e73", "linestyle": (0, (1, 1)), "linewidth": 1.8}),
 }
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # of systems
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # of systems
 _MOST_COLUMNS = 12
 _STROKES = ("-", (0, (6, 1.5)), (0, (1, 1)))
-
-
-def trajectories_figure(what: str, trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
-    """One of `PANELS` as a figure.
-
-    Args:
-        what: ``trajectory``: top view, x to the right and z ahead; ``errors``: position error over the distance
-            travelled; ``drift``: relative errors over the length of segments. All estimates are aligned to the
-            reference by 7 degrees of freedom.
-        trajectories: by name: ``reference``, ``network``, ``odometry``, ``optimised``, ``lidar``.
-        title: over the figure.
-        unit: of the positions where there is no reference.
-
-    Raises:
-        RunError: there is no reference for errors and drift.
-    """
-    with figure_style() as new_figure:
-        figure = new_figure(figsize=(7.4, 5.6 if what == "trajectory" else 3.4), layout="constrained")
-        if title:
-            figure.suptitle(title, fontsize=12)
-        PANELS[what](figure, trajectories, unit)
-    return figure
 
 
 def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
@@ -103,10 +79,8 @@ def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory]
 
 def draw_errors(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
     """Draw the position error on a figure or a part of one."""
-    reference = _reference(trajectories)
     axes, looks = canvas.subplots(), _looks(trajectories)
-    for name, trajectory in estimates(aligned(trajectories)):
-        estimate, truth = associate(trajectory, reference)
+    for name, estimate, truth in paired(trajectories):
         error = np.linalg.norm(estimate.positions - truth.positions, axis=1)
         label, look = looks[name]
         axes.plot(path_distance(truth.T_world_camera), error, label=label, **look)
@@ -119,11 +93,10 @@ def draw_errors(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit
 
 def draw_drift(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
     """Draw translation and rotation drift on a figure or a part of one."""
-    reference = _reference(trajectories)
     left, right = canvas.subplots(1, 2)
     looks, lengths = _looks(trajectories), set[float]()
-    for name, trajectory in estimates(aligned(trajectories)):
-        drifts = segment_drifts(*associate(trajectory, reference))
+    for name, estimate, truth in paired(trajectories):
+        drifts = segment_drifts(estimate, truth)
         length = [drift.length_m for drift in drifts]
         lengths.update(length)
         label, look = looks[name]
@@ -144,40 +117,6 @@ def draw_drift(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit:
 
 
 PANELS = {"trajectory": draw_trajectories, "errors": draw_errors, "drift": draw_drift}
-
-
-def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Sequence[str]) -> Figure:
-    """Frames above their disparity, near in yellow and far in black, one colour scale for all.
-
-    Args:
-        images: ``(H, W, 3)`` uint8 RGB each.
-        depths: z-depth ``(H, W)`` each, any unit; grey where it is not positive and finite.
-        labels: over each frame.
-    """
-    from matplotlib import colormaps
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-    height, width = images[0].shape[:2]
-    columns = min(len(images), 3 if width > 2 * height else 5)
-    blocks = -(-len(images) // columns)
-    disparities = [_disparity(depth) for depth in depths]
-    seen = np.concatenate([disparity.compressed() for disparity in disparities])
-    limits = np.percentile(seen, [2, 98]) if seen.size else np.array([0.0, 1.0])
-    colours = colormaps["inferno"].with_extremes(bad="#9aa0a6")
-    with figure_style() as new_figure:
-        block_width = 7.4 / columns
-        size = (7.4, blocks * (2 * block_width * height / width + 0.3))
-        narrow = ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)
-        figure = new_figure(figsize=size, layout=narrow)
-        grid = figure.subplots(2 * blocks, columns, squeeze=False)
-        for axes in grid.flat:
-            axes.axis("off")
-        for k, (image, disparity, label) in enumerate(zip(images, disparities, labels)):
-            row, column = divmod(k, columns)
-            grid[2 * row, column].imshow(image)
-            grid[2 * row, column].set_title(label, fontsize=9, loc="left", pad=3)
-            grid[2 * row + 1, column].imshow(disparity, cmap=colours, vmin=limits[0], vmax=limits[1])
-    return figure
 
 
 @dataclass(frozen=True)
@@ -204,20 +143,13 @@ def map_figure(view: AerialView, trajectory: Trajectory | None = None, unit: str
         axes.imshow(view.image, extent=(*view.x, *view.z), interpolation="antialiased", zorder=2)
         if trajectory:
             path = trajectory.positions[:, [0, 2]]
-            look = _LOOKS["optimised"][1] | {"linewidth": 1.2, "zorder": 4}
+            look = LOOKS["optimised"][1] | {"linewidth": 1.2, "zorder": 4}
             axes.plot(path[:, 0], path[:, 1], color="white", linewidth=2.6, zorder=3)
             axes.plot(path[:, 0], path[:, 1], **look, label="Optimised trajectory")
             figure.legend(loc="outside upper center")
         axes.set_aspect("equal")
         axes.set(xlim=view.x, ylim=view.z, xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
     return figure
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=160, metadata={"Software": None})
-    return buffer.getvalue()
 
 
 def plot_systems(trajectories: Mapping[str, Trajectory], what: Sequence[str], output: Path) -> None:
@@ -318,28 +250,16 @@ def _save(figure: Figure, output: Path) -> None:
 def _looks(names: Iterable[str]) -> dict[str, tuple[str, dict[str, Any]]]:
     """Label and style of every trajectory; those of other systems in the order given."""
     names = list(names)
-    others = [name for name in names if name not in _LOOKS]
+    others = [name for name in names if name not in LOOKS]
     looks = {}
     for k, name in enumerate(others):
-        stroke = _STROKES[k // len(_COLOURS) % len(_STROKES)]
-        looks[name] = (name, {"color": _COLOURS[k % len(_COLOURS)], "linestyle": stroke, "linewidth": 1.5})
-    return {name: looks.get(name) or _LOOKS[name] for name in names}
+        stroke = _STROKES[k // len(COLOURS) % len(_STROKES)]
+        looks[name] = (name, {"color": COLOURS[k % len(COLOURS)], "linestyle": stroke, "linewidth": 1.5})
+    return {name: looks.get(name) or LOOKS[name] for name in names}
 
 
 def _beside() -> dict[str, Any]:
     return {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
-
-
-def _reference(trajectories: Mapping[str, Trajectory]) -> Trajectory:
-    if REFERENCE not in trajectories:
-        raise RunError("errors and drift need ground truth, and this run has no reference")
-    return trajectories[REFERENCE]
-
-
-def _disparity(depth: DepthMap) -> Any:
-    """1 / depth, masked where there is no depth."""
-    known = np.isfinite(depth) & (depth > 0)
-    return np.ma.masked_array(1.0 / np.where(known, depth, 1.0), mask=~known)
 
 
 def _share_heights(drawn: Sequence[Sequence[Axes]]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from slam.results.error_columns import (
@@ -22,9 +21,8 @@ from slam.results.error_columns import (
     Errors,
     written,
 )
-from slam.results.metrics import AgreementMetrics, GpsErrors, LoopsFile, Metrics, Stretch
-from slam.runtime.errors import RunError
-from slam.runtime.run_files import METRICS, TRAJECTORIES
+from slam.results.metrics import CAMERA_HEIGHTS, METRES, GpsErrors, LoopsFile, Metrics, Stretch
+from slam.runtime.run_files import LOOPS, METRICS, TRAJECTORIES
 from slam.runtime.storage.record import NOT_RECORDED, Missing, known
 
 
@@ -72,8 +70,9 @@ def number(value: Any, decimals: int = 0) -> Cell:
 def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
     """The key numbers that there are: name, value and unit of each."""
     best = metrics.trajectories.optimised
+    fitted = ("dof6", "m, 6 dof") if metrics.is_metric else ("dof7", "m, 7 dof")
     wanted = [
-        ("Position error", number(best.align.dof7.ate_rmse_m, 2), "m, 7 dof"),
+        ("Position error", number(getattr(best.align, fitted[0]).ate_rmse_m, 2), fitted[1]),
         ("Drift, t_rel", number(T_REL.value(best), 2), "%"),
         ("Path", number(metrics.sequence.length_m), "m"),
         ("Frames", number(metrics.sequence.frames), ""),
@@ -91,7 +90,7 @@ def what_ran(metrics: Metrics) -> Table:
         missing = f"{DASH} ({value.reason})" if isinstance(value, Missing) else ""
         return missing or f"{written(value, decimals)[:most]}{unit}"
 
-    sequence, scale, ran = metrics.sequence, metrics.scale, metrics.provenance
+    sequence, ran = metrics.sequence, metrics.provenance
     noise = text(ran.noise_sha256, most=16)
     rows = [
         ("Sequence", f"{text(sequence.name)}, {text(sequence.frames)} frames"),
@@ -100,8 +99,7 @@ def what_ran(metrics: Metrics) -> Table:
         *([("LiDAR scans left out", left_out)] if (left_out := _stretches(sequence.unreadable_scans)) else []),
         ("True length", text(sequence.length_m, unit=" m")),
         ("Frame rate", text(sequence.fps, unit=" frames/s")),
-        ("Scale", f"mode {text(scale.mode)}, value {text(scale.value, 4)}"),
-        *((f"{each.source} beside {each.beside}", _agreement(each)) for each in known(metrics.agreement) or ()),
+        ("Scale", _scale(metrics)),
         ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
         ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
         ("Noise of the poses", noise if DASH in noise else f"noise.yaml, sha256 {noise}"),
@@ -117,8 +115,15 @@ def what_ran(metrics: Metrics) -> Table:
     return Table((), _texts(recorded), "words")
 
 
-def _agreement(found: AgreementMetrics) -> str:
-    return f"{written(known(found.sigmas), 1)} sigmas: {known(found.figure)}"
+def _scale(metrics: Metrics) -> str:
+    scale = metrics.scale
+    if isinstance(scale.value, Missing):
+        return f"mode {known(scale.mode) or DASH}, {scale.value.reason}"
+    spread, frames = known(scale.spread), known(scale.frames_used)
+    unit = metrics.unit if metrics.unit in (METRES, CAMERA_HEIGHTS) else "units of the result"
+    certain = "" if spread is None else f", spread {100 * spread:.1f} %"
+    used = "" if frames is None else f", measured in {frames} frames"
+    return f"mode {known(scale.mode)}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
 
 
 def gps(metrics: Metrics) -> Table | None:
@@ -194,17 +199,16 @@ def alignments(metrics: Metrics) -> Table | None:
     return Table(["alignment", *(label for _, label, _ in _PER_ALIGNMENT)], rows) if rows else None
 
 
-def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
+def loops(metrics: Metrics, details: LoopsFile) -> dict[str, Any] | None:
     """``counts`` of loops, ``reasons`` of those that are missing, and a ``table`` of the accepted and the rejected."""
     found = metrics.loops
     if isinstance(found, Missing):
         return None
     stages = {"candidates": found.candidates, "verified": found.verified, "accepted": found.accepted}
-    details = _details(loops_file)
     groups = (("accepted", details.accepted), ("rejected", found.rejected))
     rows = [(str(loop.from_), str(loop.to), verdict, loop.reason) for verdict, group in groups for loop in group]
     left_out = known(details.rejected_left_out)
-    where = loops_file.name + (f", without {left_out} rejected ones of fewest inliers" if left_out else "")
+    where = LOOPS + (f", without {left_out} rejected ones of fewest inliers" if left_out else "")
     return {
         "counts": ", ".join(f"{number(value).text} {stage}" for stage, value in stages.items()),
         "reasons": notes_on(number(value).tooltip for value in stages.values()),
@@ -228,23 +232,12 @@ def tracking(metrics: Metrics) -> dict[str, Any] | None:
 
 
 def graph(metrics: Metrics) -> dict[str, Any] | None:
-    """``nodes`` and ``factors`` of the pose graph, and its ``coverage`` or the ``reasons`` why there is none."""
+    """``nodes`` and ``factors`` of the pose graph, and the ``reasons`` why its noise is not covered."""
     found = metrics.graph
     if isinstance(found, Missing):
         return None
-    size = {"nodes": number(found.nodes).text, "factors": number(found.factors).text}
-    coverage = found.coverage
-    if isinstance(coverage, Missing):
-        return size | {"coverage": None, "reasons": notes_on([f"coverage: {coverage.reason}"])}
-    rows = []
-    for level, ratio in ((50, coverage.inside_50), (90, coverage.inside_90), (95, coverage.inside_95)):
-        shown = number(ratio) if isinstance(ratio, Missing) else Cell(f"{100 * ratio:.0f} %")
-        rows.append([Cell(f"inside the {level} % quantile"), shown])
-    words = (
-        "Fraction of factors whose error at the truth lies inside a quantile of their stated noise. A fraction below "
-        "its quantile means sigmas that are too small, one above it sigmas that are too large."
-    )
-    return size | {"coverage": Table(("factors", "fraction"), rows, "words", [words]), "reasons": []}
+    reasons = notes_on([f"coverage: {found.coverage.reason}"]) if isinstance(found.coverage, Missing) else []
+    return {"nodes": number(found.nodes).text, "factors": number(found.factors).text, "reasons": reasons}
 
 
 def timing(metrics: Metrics) -> Table | None:
@@ -254,7 +247,7 @@ def timing(metrics: Metrics) -> Table | None:
         return None
     timed = sum(stages.values())
     total = max(known(metrics.timing.seconds_total) or 0.0, timed, 1e-9)
-    stages = {_STAGES.get(name, name): seconds for name, seconds in stages.items()} | {"everything else": total - timed}
+    stages = {_STAGES.get(name, name): seconds for name, seconds in stages.items()} | {"between stages": total - timed}
     longest = max(*stages.values(), 1e-9)
     rows = [
         [Cell(name), Cell(f"{seconds:.1f} s"), Cell(f"{100 * seconds / total:.0f} %"), _bar(seconds / longest)]
@@ -305,14 +298,6 @@ def notes_on(reasons: Iterable[str]) -> list[str]:
     """One line with the reasons of missing numbers, each once; none where nothing is missing."""
     distinct = [reason for reason in dict.fromkeys(reasons) if reason]
     return [f"{DASH}  {'; '.join(distinct)}."] if distinct else []
-
-
-def _details(loops_file: Path) -> LoopsFile:
-    """``loops.json``; empty where the file is missing or damaged."""
-    try:
-        return LoopsFile.read(loops_file)
-    except (OSError, RunError):
-        return LoopsFile()
 
 
 def _depth_source(metrics: Metrics) -> str:

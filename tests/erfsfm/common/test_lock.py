@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -37,6 +38,24 @@ def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
     assert not list((tmp_path / "run").iterdir())
+
+
+def test_who_waits_holds_a_folder_after_the_other(tmp_path: Path) -> None:
+    events = []
+
+    def wait() -> None:
+        with FolderLock() as other:
+            other.wait_for(tmp_path)
+            events.append("waited")
+
+    with FolderLock() as lock:
+        lock.wait_for(tmp_path)
+        thread = Thread(target=wait)
+        thread.start()
+        thread.join(0.3)
+        events.append("held")
+    thread.join(30)
+    assert events == ["held", "waited"]
 
 
 def test_a_process_that_was_killed_holds_nothing_though_one_that_it_forked_lives_on(tmp_path: Path) -> None:

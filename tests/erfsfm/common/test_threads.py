@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -30,3 +31,20 @@ def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
 def test_they_are_limited_without_torch() -> None:
     program = "import sys, erfsfm.common.threads; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_one_process_of_many_starts_no_threads() -> None:
+    program = (
+        "import cv2, numpy\n"
+        "from threadpoolctl import threadpool_info\n"
+        "from erfsfm.common.threads import stay_single_threaded, usable_cores\n"
+        "cv2.setNumThreads(3)\n"
+        "stay_single_threaded()\n"
+        "import torch\n"
+        "counts = [pool['num_threads'] for pool in threadpool_info()]\n"
+        "assert {*counts, cv2.getNumThreads(), usable_cores(), torch.get_num_threads()} == {1}, counts\n"
+    )
+    threads = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    free = {name: value for name, value in os.environ.items() if name not in threads}
+    done = subprocess.run([sys.executable, "-c", program], env=free, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

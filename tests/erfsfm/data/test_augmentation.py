@@ -65,6 +65,18 @@ def test_the_papers_flip_is_one_pixel_off() -> None:
     assert project(camera, POINTS[0] * [-1, 1, 1])[0] - centre_of(varied[0])[0] == pytest.approx(1, abs=0.05)
 
 
+def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded() -> None:
+    images = [np.zeros((96, 160, 3), np.uint8)]
+    _, _, camera, _ = augment(images, [], CAMERA, DataConfig(flip=0, zoom=1.15), "paper", np.random.default_rng(7))
+    rng = np.random.default_rng(7)
+    rng.random()
+    zoom_x, zoom_y = rng.uniform(1, 1.15, 2)
+    left, top = (int(rng.integers(int(side * zoom) - side + 1)) for side, zoom in ((160, zoom_x), (96, zoom_y)))
+    assert left > 0 and top > 0
+    assert (camera.fx, camera.cx) == (110 * zoom_x, 77 * zoom_x - left)
+    assert (camera.fy, camera.cy) == (120 * zoom_y, 50 * zoom_y - top)
+
+
 def test_zero_augmentation_changes_nothing() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     varied, _, camera, _ = augment(images, [], CAMERA, DataConfig(flip=0, zoom=1), "default", np.random.default_rng(0))

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -67,6 +68,40 @@ def test_what_was_measured_is_kept_and_what_was_lost_is_measured_again(recording
     teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
     assert told == [("teacher: depth", 1, 1)]
     assert kept.stat().st_mtime_ns == written and len(lost.read_bytes()) == len(before)
+
+
+def test_of_two_programs_with_one_folder_one_measures(recording, teacher, tmp_path):
+    told = {1: [], 2: []}
+    both = {number: ManyViewTeacher(tmp_path, SIZE, stride=12) for number in told}
+    both[1].drive(recording).keep_poses(teacher.drive(recording).T_world_camera)
+
+    def prepare(number):
+        both[number].prepare([recording], 4, "sim", lambda *progress: told[number].append(progress))
+
+    threads = [Thread(target=prepare, args=(number,)) for number in told]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert sorted(map(len, told.values())) == [0, 1], "measured once"
+    assert all(both[2].drive(recording).label_file(target).is_file() for target in (12, 24))
+
+
+def test_images_are_read_again_only_when_they_changed(recording, tmp_path, monkeypatch):
+    shutil.copytree(recording.images[0].parents[3], tmp_path / "world")
+    copy = discover(tmp_path / "world")[0]
+    read = []
+    original = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path) or original(path))
+
+    def folder():
+        return ManyViewTeacher(tmp_path / "teacher", SIZE, stride=6).drive(copy).folder
+
+    first = folder()
+    assert len(read) == 28
+    assert folder() == first and len(read) == 28
+    copy.images[3].write_bytes(original(copy.images[4]))
+    assert folder() != first and len(read) == 56
 
 
 def test_an_image_that_cannot_be_read_has_no_label_and_is_no_neighbour(recording, teacher, tmp_path):

@@ -65,6 +65,17 @@ def test_a_partly_absent_validation_is_logged(
     assert [record.message for record in caplog.records] == messages
 
 
+@pytest.mark.parametrize(("fidelity", "cx"), [("default", 24 * 2 / 3 - 0.5), ("paper", 23.5 * 2 / 3)])
+def test_samples_have_the_intrinsics_of_their_fidelity(coded: Path, fidelity: str, cx: float) -> None:
+    """Images of 48 pixels at a width of 32."""
+    config = experiment(flip=0, zoom=1)
+    network = config.network.model_copy(update={"width": 32, "fidelity": fidelity})
+    config = config.model_copy(update={"network": network})
+    recordings = discover(coded / "a")
+    for sample in (SnippetDraws(recordings, config, 1).draw(0), ValidationSnippets(recordings, config)[0]):
+        assert float(sample["K"][0, 2]) == pytest.approx(cx)
+
+
 def test_snippets_with_a_broken_image_are_passed_over_and_others_stay(
     coded: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -44,7 +44,7 @@ STEP = (0.05, 0.0, 0.1)
 
 def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=11, depth=True, seed=600, step=STEP)
-    networks, median = depth_protocol(Oracle(STEP), tmp_path, allow_leak=False)
+    networks, median = depth_protocol(Oracle(STEP), [tmp_path], allow_leak=False)
     assert networks["images"] == 3, "every fifth frame"
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
     assert networks["scale"] == pytest.approx(np.mean([6.0, 5.5, 5.0]) / 3, abs=1e-3)
@@ -58,7 +58,7 @@ def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small:
     roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
     data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3}
     pack(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "pack")
-    networks, _ = depth_protocol(Oracle(STEP), tmp_path / "pack", allow_leak=False)
+    networks, _ = depth_protocol(Oracle(STEP), [tmp_path / "pack"], allow_leak=False)
     assert networks["images"] == 3
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
 
@@ -117,7 +117,7 @@ def test_refusals(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     with pytest.raises(DataError, match="no sequence 07"):
         pose_protocol(Oracle(STEP), tmp_path / "short", ["07"], "default", allow_leak=False)
     with pytest.raises(DataError, match="no true depth"):
-        depth_protocol(Oracle(STEP), tmp_path / "short", allow_leak=False)
+        depth_protocol(Oracle(STEP), [tmp_path / "short"], allow_leak=False)
     (tmp_path / "short/poses/00.txt").unlink()
     with pytest.raises(DataError, match="no true poses"):
         pose_protocol(Oracle(STEP), tmp_path / "short", ["00"], "default", allow_leak=False)
@@ -128,4 +128,4 @@ def test_depth_of_several_sizes_is_refused(tmp_path: Path, write_root: Callable[
     write_root(tmp_path / "b", frames=1, seed=601, depth=True, size=(32, 48))
     assert len(discover(tmp_path)) == 2
     with pytest.raises(DataError, match="different sizes"):
-        depth_protocol(Oracle(STEP), tmp_path, allow_leak=False)
+        depth_protocol(Oracle(STEP), [tmp_path], allow_leak=False)

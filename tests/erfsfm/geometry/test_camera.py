@@ -24,6 +24,15 @@ def test_resize_keeps_half_pixels() -> None:
     assert (half.fx, half.fy) == (5, 5)
 
 
+def test_the_paper_resizes_without_half_pixels() -> None:
+    """Camera 2 of KITTI 00: the reference has cx 607.1928 * 416 / 1241."""
+    kitti = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
+    paper = kitti.resized(416, 128, "paper")
+    assert (paper.width, paper.height) == (416, 128)
+    np.testing.assert_allclose([paper.fx, paper.fy, paper.cx, paper.cy], [240.97, 244.717, 203.54, 63.052], atol=5e-3)
+    assert kitti.resized(416, 128).cx == pytest.approx(203.207, abs=1e-3)
+
+
 @pytest.mark.parametrize("size", [(416, 128), (200, 240), (33, 7)])
 def test_project_then_resize(size: tuple[int, int]) -> None:
     scale = np.array([size[0] / CAMERA.width, size[1] / CAMERA.height])

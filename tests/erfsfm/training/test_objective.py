@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
 from erfsfm.common.errors import ConfigError
-from erfsfm.config import ExperimentConfig, LossConfig, TeacherConfig
+from erfsfm.config import ExperimentConfig, LossConfig, TeacherConfig, load_experiment
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective
@@ -180,7 +180,7 @@ def bilinear(image: np.ndarray, x: float, y: float) -> np.ndarray:
 
 
 def naive_photometric(batch: SnippetBatch, disparities: list[Tensor], vectors: np.ndarray) -> float:
-    """The reference's loss pixel by pixel: mean |target - warp| valid, summed over scales and sources."""
+    """The reference's loss pixel by pixel: mean |target - warp| valid of images in [-1, 1], over scales and sources."""
     total = 0.0
     for level, disparity in enumerate(disparities):
         ratio = 2**level
@@ -190,7 +190,7 @@ def naive_photometric(batch: SnippetBatch, disparities: list[Tensor], vectors: n
             K[:2] /= ratio
 
             def shrink(image: Tensor) -> np.ndarray:
-                blocks = image.numpy().reshape(3, height, ratio, width, ratio)  # noqa: B023
+                blocks = (2 * image.numpy() - 1).reshape(3, height, ratio, width, ratio)  # noqa: B023
                 return blocks.mean(axis=(2, 4)).transpose(1, 2, 0)
 
             target = shrink(batch.target[b])
@@ -225,6 +225,22 @@ def test_mean_is_the_papers_formula() -> None:
     expected = naive_photometric(batch, disparities, vectors.numpy())
     assert float(outcome.terms["photometric"]) == pytest.approx(expected, rel=1e-9)
     assert float(outcome.total) == pytest.approx(expected, rel=1e-9), "smoothness has no weight here"
+
+
+def test_a_row_of_the_paper_weighs_its_terms_as_the_reference_does() -> None:
+    """Grey 0.3 beside 0.5 is 0.4 apart in [-1, 1]: 0.4 of each source and scale, and 0.2 of the smoothness."""
+
+    class Parabola(nn.Module):
+        def forward(self, image: Tensor) -> list[Tensor]:
+            return [1 / (torch.arange(64 >> s) ** 2 + 1).double().expand(1, 1, 32 >> s, 64 >> s) for s in range(4)]
+
+    K = torch.tensor([[[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]]).double()
+    images = torch.full((1, 5, 3, 32, 64), 0.5).double()
+    batch = SnippetBatch(torch.full((1, 3, 32, 64), 0.3).double(), images[:, 1:], K)
+    still = FixedPose(torch.zeros(4, 6).double()).requires_grad_(False)
+    outcome = evaluate_objective(Parabola(), still, batch, load_experiment("table1-posenet-416x128"))
+    smoothness = 2 * (1 + 1 / 2 + 1 / 4 + 1 / 8)
+    assert float(outcome.total) == pytest.approx(0.4 * 4 * 4 + 0.2 * smoothness)
 
 
 def test_smoothness_halves_from_scale_to_scale() -> None:

@@ -179,11 +179,11 @@ def test_two_runs_are_equal(alone: Configure, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "schedule, normalisation, optimiser",
+    "schedule, normalisation, optimiser, average_decay",
     [
-        ("constant", "none", "adam"),
-        ("cosine", "batch", "adam"),
-        pytest.param("cosine", "batch", "muon", marks=pytest.mark.slow),
+        ("constant", "none", "adam", 0),
+        ("cosine", "batch", "adam", 0.8),
+        pytest.param("cosine", "batch", "muon", 0, marks=pytest.mark.slow),
     ],
 )
 def test_resume_ends_with_identical_weights(
@@ -194,10 +194,12 @@ def test_resume_ends_with_identical_weights(
     schedule: str,
     normalisation: str,
     optimiser: str,
+    average_decay: float,
 ) -> None:
     """Interrupted at step 5 of 6; the last checkpoint is of step 4, where there also was a validation."""
     small["network"]["normalisation"] = normalisation
     training = {"steps": 6, "schedule": schedule, "learning_rate": 1e-3, "gradient_clip": 1.0, "optimiser": optimiser}
+    training |= {"average_decay": average_decay}
     config = both(training=training)
     train(config, tmp_path / "whole", device="cpu")
     interrupted(monkeypatch, config, tmp_path / "cut", 5)
@@ -218,6 +220,24 @@ def test_resume_ends_with_identical_weights(
     assert records[0].step == records[1].step == 6
     assert (tmp_path / "cut" / "logs" / "csv" / "metrics.csv").is_file(), "the log before the interruption stays"
     assert (tmp_path / "cut" / "logs" / "csv_from_4" / "metrics.csv").is_file()
+
+
+def test_the_average_of_the_weights_is_what_is_measured_and_written(
+    both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def steps_of(name: str, **training: Any) -> Path:
+        return train(both(training={"validate_every": 1, **training}), tmp_path / name, device="cpu") / "last"
+
+    first, second, third = (weights_of(steps_of(str(steps), steps=steps)) for steps in (1, 2, 3))
+    expected = [a / 4 + b / 4 + c / 2 for a, b, c in zip(first, second, third, strict=True)]
+    averaged = steps_of("averaged", steps=3, average_decay=0.5)
+    torch.testing.assert_close(weights_of(averaged), expected)
+    still = both(training={"steps": 1, "learning_rate": 1e-12}).model_copy(update={"initial_weights": str(averaged)})
+    again = load_model(train(still, tmp_path / "still", device="cpu")).record.metrics
+    assert load_model(averaged).record.metrics == pytest.approx(again, rel=1e-4)
+    config = both(training={"steps": 5, "validate_every": 4, "average_decay": 0.5})
+    interrupted(monkeypatch, config, tmp_path / "cut", 3)
+    torch.testing.assert_close(weights_of(tmp_path / "cut" / "last"), expected)
 
 
 @pytest.mark.parametrize("moment", ["in a step", "in the second checkpoint"])
@@ -622,6 +642,15 @@ def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path) -> None:
         train(config, tmp_path / "run", device="cpu")
 
 
+def test_a_start_that_was_interrupted_while_the_teacher_measured_goes_on(
+    alone: Configure, world: Path, tmp_path: Path
+) -> None:
+    teacher = poses_measured(world, tmp_path)
+    shutil.move(teacher.pop("cache"), tmp_path / "run" / "teacher")
+    config = alone(training={"networks": "pose", "steps": 1}, teacher=teacher)
+    assert load_model(train(config, tmp_path / "run", device="cpu")).record.step == 1
+
+
 def test_a_failed_start_leaves_nothing(alone: Configure, tmp_path: Path) -> None:
     config = alone().model_copy(update={"initial_weights": "nowhere"})
     with pytest.raises(CheckpointError):
@@ -814,7 +843,7 @@ def test_two_processes_are_one_with_twice_the_batch(
     """Batches of 2 in each of two processes; of 4 in one."""
 
     def run(name: str, resume: bool = False, **training: Any) -> None:
-        config = both(training=training, data={"workers": workers})
+        config = both(training={"average_decay": 0.5} | training, data={"workers": workers})
         in_processes(config, tmp_path / name, resume)
 
     run("one", batch=4)
@@ -842,3 +871,34 @@ def test_two_processes_stop_together_though_they_measure_different_things(
     in_processes(both(training=training), tmp_path / "run", before=measured)
     assert load_model(tmp_path / "run" / "last").record.step == 3
     assert load_model(tmp_path / "run").record.metrics == {"abs_rel": 0.2}
+
+
+@pytest.mark.slow
+def test_two_processes_end_together_by_a_loss_of_one_that_is_not_finite(
+    both: Configure, tmp_path: Path, in_processes: Callable[..., None]
+) -> None:
+    spoiled = """
+import os
+from erfsfm.common.errors import TrainingError
+
+step, run = SelfSupervision.training_step, train
+
+def poisoned(self, batch, index):
+    if self.global_rank == self.global_step == 1:
+        batch["target"] *= float("nan")
+    return step(self, batch, index)
+
+def train(*arguments, **named):
+    try:
+        run(*arguments, **named)
+    except TrainingError as error:
+        assert "the loss at step 1 is not finite" in str(error), error
+    else:
+        raise AssertionError("trained on")
+    if os.environ["NODE_RANK"] == "1":
+        sys.exit()
+
+SelfSupervision.training_step = poisoned
+"""
+    in_processes(both(training={"steps": 6, "nodes": 2}), tmp_path / "run", before=spoiled)
+    assert load_model(tmp_path / "run" / "last").record.step == 1

@@ -53,7 +53,7 @@ for verb in verbs:
     result = CliRunner().invoke(app, [verb, "--help"])
     assert result.exit_code == 0 and "Example: erfsfm-slam " + verb in result.output, (verb, result.output)
     print(verb)
-libraries = {"torch", "lightning", "cv2", "gtsam", "open3d", "evo", "matplotlib", "scipy", "numpy", "rich"}
+libraries = {"torch", "lightning", "cv2", "gtsam", "open3d", "evo", "matplotlib", "plotly", "scipy", "numpy", "rich"}
 heavy = libraries & set(sys.modules)
 assert not heavy, heavy
 """

@@ -5,17 +5,10 @@
   const part = name => figure.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas");
 
-  async function unpacked(name) {
-    const packed = Uint8Array.from(atob(part(name).textContent.trim()), letter => letter.charCodeAt(0));
-    return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
-  }
-
   async function load() {
     if (!canvas.getContext("webgl2")) throw new Error("WebGL 2 is not available");
-    const script = document.createElement("script");
-    script.textContent = new TextDecoder().decode(await unpacked("three"));
-    document.head.append(script);
-    return geometry(JSON.parse(part("about").textContent), await unpacked("mesh"));
+    await runPacked(part("three"));
+    return geometry(JSON.parse(part("about").textContent), await unpacked(part("mesh")));
   }
 
   // Positions as 16 bit fractions of a box, colours, and each corner's number less that of the corner before

@@ -89,7 +89,9 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_
         rows = {row["drive"]: row for row in csv.DictReader(file)}
     assert rows["good"]["status"] == "whole" and rows["good"]["frames"] == "6"
     assert rows["bad"]["status"] == "failed" and "no data set at nowhere" in rows["bad"]["reason"]
-    assert "no data set at nowhere" in (output / "index.html").read_text()
+    page = (output / "index.html").read_text()
+    assert "no data set at nowhere" in page
+    assert "off the truth" in page and page.count('class="plot"') == 2 and page.count('id="plotly"') == 1
     written = (output / "good" / "metrics.json").stat().st_mtime_ns
 
     options = [*words[:6], "--weights", str(tiny_weights), "--frames", "0:6", "--seed", "0", "--device", "auto"]

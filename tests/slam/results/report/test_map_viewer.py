@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -63,7 +64,7 @@ def test_what_is_packed_is_the_mesh(plain: Ply) -> None:
 @pytest.fixture
 def report(make_run: MakeRun, map_views: MapViews) -> Path:
     folder = make_run()
-    write_report(folder, [], map_views)
+    write_report(folder, views=map_views)
     return folder.path / "report.html"
 
 
@@ -102,6 +103,15 @@ def test_it_draws_and_turns_without_a_word_on_the_console(report: Path) -> None:
     turned = canvas_after(report, f"figure.querySelector('canvas').dispatchEvent({keys})")
     for other in (above, turned):
         assert abs(other - seat).mean() > 0.02
+
+
+@browser
+def test_every_plot_is_drawn_and_nothing_offers_to_send_it(report: Path) -> None:
+    page, console = browse(report, "--dump-dom")
+    assert console == []
+    assert page.count('class="plot"') == page.count('class="modebar-container"') == 6
+    titles = set(re.findall('data-title="([^"]*)"', page))
+    assert titles == {"Zoom", "Pan", "Reset axes", "Download plot as a PNG"}
 
 
 @browser

@@ -1,0 +1,219 @@
+"""Interactive figures of the report and of the page of a batch, by Plotly. A line without a colour has that of text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import cv2
+import numpy as np
+from plotly import graph_objects as go
+from plotly.subplots import make_subplots
+from scipy.spatial.transform import Rotation
+
+from slam.evaluation.coverage import LEVELS
+from slam.evaluation.drift import aligned, paired, segment_drifts
+from slam.formats.trajectory import Trajectory, associate
+from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
+from slam.results.metrics import AcceptedLoop, CoverageMetrics, Stretch
+from slam.results.report.plots import COLOURS, LOOKS, AerialView
+from slam.results.report.rendering import address_of
+from slam.runtime.run_files import REFERENCE
+from slam.runtime.storage.record import known
+
+_DASHES = {REFERENCE: "dash", "odometry": "dashdot", "lidar": "dot"}
+_STRETCHES = 25  # of a path, over which lengths are compared
+_MAP, _PANEL = 560, 230  # heights, px
+_MOST_POINTS = 300  # of a drive among others
+
+
+def trajectories_figure(
+    trajectories: Mapping[str, Trajectory],
+    unit: str,
+    loops: Sequence[AcceptedLoop] = (),
+    view: AerialView | None = None,
+) -> go.Figure:
+    """Trajectories from above: as written over the map where there is a view of it, else `aligned`.
+
+    Args:
+        trajectories: by name.
+        unit: of their positions.
+        loops: accepted ones, whose places are marked on the optimised trajectory.
+        view: the map, in the world of the optimised trajectory.
+    """
+    trajectories = aligned(trajectories) if view is None else trajectories
+    figure = go.Figure()
+    for name, trajectory in trajectories.items():
+        where = f"x %{{x:.2f}}, z %{{y:.2f}} {unit}"
+        x, _, z = trajectory.positions.T
+        figure.add_trace(_line(name, x, z, _frames(trajectory, trajectories), where))
+    if loops and "optimised" in trajectories:
+        at = trajectories["optimised"].positions[[loop.to for loop in loops]]
+        text = [f"loop: frame {loop.to} is where frame {loop.from_} was, {loop.reason}" for loop in loops]
+        marker = {"symbol": "circle-open", "size": 9, "color": COLOURS[1]}
+        look = {"mode": "markers", "name": "Loops", "marker": marker, "text": text, "hoverinfo": "text"}
+        figure.add_trace(go.Scatter(x=_single(at[:, 0]), y=_single(at[:, 2]), **look))
+    if view is not None:
+        written, content = cv2.imencode(
+            ".webp", cv2.cvtColor(view.image, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_WEBP_QUALITY, 85]
+        )
+        size = {"sizex": view.x[1] - view.x[0], "sizey": view.z[1] - view.z[0], "sizing": "stretch", "layer": "below"}
+        source = address_of(content.tobytes(), "webp") if written else ""
+        figure.add_layout_image(source=source, x=view.x[0], y=view.z[1], xref="x", yref="y", **size)
+        figure.update_xaxes(range=view.x, showgrid=False, zeroline=False)
+        figure.update_yaxes(range=view.z, showgrid=False, zeroline=False)
+    return _from_above(figure, unit)
+
+
+def drives_figure(drives: Mapping[str, Trajectory]) -> go.Figure:
+    """Trajectories of several drives from above, each from the origin and in its own unit."""
+    figure = go.Figure()
+    for k, (name, trajectory) in enumerate(drives.items()):
+        rows = np.linspace(0, len(trajectory) - 1, min(len(trajectory), _MOST_POINTS)).round().astype(np.int32)
+        x, _, z = trajectory.positions[rows].T
+        line = {"color": COLOURS[k % len(COLOURS)], "width": 1.8}
+        words = "frame %{customdata}: x %{x:.2f}, z %{y:.2f}"
+        look = {"mode": "lines", "name": escape(name), "line": line, "hovertemplate": words}
+        figure.add_trace(go.Scatter(x=_single(x), y=_single(z), customdata=rows, **look))
+    return _from_above(figure, "unit of the drive")
+
+
+def bars_figure(bars: Mapping[str, float], title: str) -> go.Figure:
+    """A bar for each name, the first on top."""
+    names = [escape(name) for name in bars]
+    bar = {"orientation": "h", "marker": {"color": COLOURS[0]}, "hovertemplate": "%{y}: %{x:.3g}<extra></extra>"}
+    figure = go.Figure(go.Bar(x=list(bars.values()), y=names, **bar))
+    figure.update_yaxes(autorange="reversed", type="category")
+    return figure.update_xaxes(title=title).update_layout(height=90 + 22 * len(bars))
+
+
+def error_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
+    """Distance to the true position over the distance travelled, after the 7-dof alignment."""
+    figure = go.Figure()
+    for name, estimate, truth in paired(trajectories):
+        error = np.linalg.norm(estimate.positions - truth.positions, axis=1)
+        path, frames = path_distance(truth.T_world_camera), _frames(truth, trajectories)
+        figure.add_trace(_line(name, path, error, frames, "%{y:.3f} m off after %{x:.1f} m"))
+    figure.update_xaxes(title="distance travelled (m)")
+    figure.update_yaxes(title="position error (m)", rangemode="tozero")
+    return figure.update_layout(height=_PANEL + 90)
+
+
+def drift_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
+    """Relative errors over the length of segments, after the 7-dof alignment."""
+    figure = _panels("translation (%)", "rotation (deg / 100 m)")
+    for name, estimate, truth in paired(trajectories):
+        drifts = segment_drifts(estimate, truth)
+        lengths = np.array([drift.length_m for drift in drifts])
+        values = (
+            (np.array([100.0 * drift.translation for drift in drifts]), "%{y:.2f} % of %{x} m"),
+            (np.rad2deg([100.0 * drift.rotation for drift in drifts]), "%{y:.3f} deg / 100 m over %{x} m"),
+        )
+        for row, (value, words) in enumerate(values, 1):
+            line = _line(name, lengths, value, None, words, mode="lines+markers", showlegend=row == 1)
+            figure.add_trace(line, row, 1)
+    figure.update_xaxes(title="segment length (m)", row=2)
+    return figure.update_yaxes(rangemode="tozero")
+
+
+def scale_figure(trajectories: Mapping[str, Trajectory], is_metric: bool, gaps: Iterable[Stretch]) -> go.Figure:
+    """Lengths over the true ones, and the error of the rotation, over time.
+
+    Args:
+        trajectories: with the reference.
+        is_metric: lengths of all but the network are then taken as written, else after the 7-dof alignment.
+        gaps: interpolated frames, which are shaded.
+    """
+    figure, reference = _panels("length / true length", "rotation error (deg)"), trajectories[REFERENCE]
+    for name, estimate, truth in paired(trajectories):
+        measured = associate(trajectories[name], reference)[0] if is_metric and name != "network" else estimate
+        frames, seconds = _frames(truth, trajectories), truth.stamps - reference.stamps[0]
+        true_path, path = path_distance(truth.T_world_camera), path_distance(measured.T_world_camera)
+        ends = np.searchsorted(true_path, true_path + true_path[-1] / _STRETCHES)
+        starts = np.flatnonzero(ends < len(path))
+        ends = ends[starts]
+        true_length = true_path[ends] - true_path[starts]
+        ratio = (path[ends] - path[starts]) / np.where(true_length > 0, true_length, np.nan)
+        middle = (starts + ends) // 2
+        figure.add_trace(_line(name, seconds[middle], ratio, frames[middle], "%{y:.3f} at %{x:.1f} s"), 1, 1)
+        turned = np.swapaxes(truth.T_world_camera[:, :3, :3], 1, 2) @ estimate.T_world_camera[:, :3, :3]
+        off = np.rad2deg(rotation_angle(turned))
+        line = _line(name, seconds, off, frames, "%{y:.2f} deg at %{x:.1f} s", showlegend=False)
+        figure.add_trace(line, 2, 1)
+    figure.update_yaxes(rangemode="tozero", row=2)
+    return _over_time(figure, reference, gaps)
+
+
+def motion_figure(trajectories: Mapping[str, Trajectory], unit: str, gaps: Iterable[Stretch]) -> go.Figure:
+    """Speed, and angles of the optimised trajectory, over time: what shows of scale and rotation without truth."""
+    figure, drawn = _panels(f"speed ({unit} / s)", "angles (deg)"), aligned(trajectories)
+    last = drawn.get("optimised") or next(iter(drawn.values()))
+    for name, trajectory in drawn.items():
+        steps, seconds = np.diff(trajectory.positions, axis=0), trajectory.stamps[1:] - last.stamps[0]
+        speed = np.linalg.norm(steps, axis=1) / np.maximum(np.diff(trajectory.stamps), 1e-9)
+        frames = _frames(trajectory, drawn)[1:]
+        figure.add_trace(_line(name, seconds, speed, frames, "%{y:.3f} at %{x:.1f} s"), 1, 1)
+    angles = np.unwrap(Rotation.from_matrix(last.T_world_camera[:, :3, :3]).as_euler("YXZ"), axis=0)
+    for name, colour, values in zip(("Yaw", "Pitch", "Roll"), COLOURS[1:], np.rad2deg(angles).T):
+        words = f"frame %{{customdata}}: {name} %{{y:.2f}} deg at %{{x:.1f}} s<extra></extra>"
+        line = {"name": name, "line": {"color": colour, "width": 1.6}, "hovertemplate": words, "mode": "lines"}
+        frames, seconds = _frames(last, drawn), last.stamps - last.stamps[0]
+        figure.add_trace(go.Scatter(x=_single(seconds), y=_single(values), customdata=frames, **line), 2, 1)
+    return _over_time(figure, last, gaps)
+
+
+def noise_figure(coverage: CoverageMetrics, by_source: Mapping[str, CoverageMetrics]) -> go.Figure:
+    """Share of factors inside the bounds of their stated noise, beside what the bounds promise."""
+    named = {"all": coverage} | dict(by_source)
+    names = [f"{name}<br>{number}" if (number := known(each.factors)) else name for name, each in named.items()]
+    figure = go.Figure()
+    for level, colour in zip(LEVELS, COLOURS[::-1]):
+        shares = [100.0 * (known(getattr(each, f"inside_{level}")) or 0.0) for each in named.values()]
+        words = f"%{{y:.0f}} % inside the {level} % bound<extra>%{{x}}</extra>"
+        bar = {"name": f"{level} % bound", "marker": {"color": colour}, "hovertemplate": words}
+        figure.add_trace(go.Bar(x=names, y=shares, **bar))
+        figure.add_hline(y=level, line={"color": colour, "dash": "dash", "width": 1.2})
+    figure.update_yaxes(title="factors inside (%)", range=(0, 104))
+    return figure.update_layout(height=_PANEL + 90)
+
+
+def _line(name: str, x: FloatArray, y: FloatArray, frames: Any, words: str, **more: Any) -> go.Scatter:
+    """A line of a trajectory, which tells the frame under the pointer."""
+    label, look = LOOKS.get(name, (name, {"linewidth": 1.8}))
+    colour = {} if look.get("color") in (None, "black") else {"color": look["color"]}
+    line = {"width": look["linewidth"], "dash": _DASHES.get(name, "solid"), **colour}
+    words = f"{'' if frames is None else 'frame %{customdata}: '}{words}<extra>{label}</extra>"
+    given = {"mode": "lines", "customdata": frames, "line": line, "name": label, "legendgroup": name, **more}
+    return go.Scatter(x=_single(x), y=_single(y), hovertemplate=words, **given)
+
+
+def _frames(trajectory: Trajectory, among: Mapping[str, Trajectory]) -> Any:
+    """The frame of every row: the row of the same stamp in the longest trajectory."""
+    longest = max(among.values(), key=lambda each: len(each.stamps))
+    return np.searchsorted(longest.stamps, trajectory.stamps - 1e-6).astype(np.int32)
+
+
+def _from_above(figure: go.Figure, unit: str) -> go.Figure:
+    figure.update_xaxes(title=f"x, right ({unit})")
+    figure.update_yaxes(title=f"z, ahead ({unit})", scaleanchor="x")
+    return figure.update_layout(height=_MAP, hovermode="closest", dragmode="pan")
+
+
+def _panels(*titles: str) -> go.Figure:
+    """Axes below each other over one x."""
+    figure = make_subplots(len(titles), 1, shared_xaxes=True, vertical_spacing=0.07)
+    for row, title in enumerate(titles, 1):
+        figure.update_yaxes(title=title, row=row)
+    return figure.update_layout(height=_PANEL * len(titles) + 40)
+
+
+def _over_time(figure: go.Figure, trajectory: Trajectory, gaps: Iterable[Stretch]) -> go.Figure:
+    for gap in gaps:
+        ends = trajectory.stamps[[max(gap.first - 1, 0), min(gap.last + 1, len(trajectory) - 1)]]
+        figure.add_vrect(*(ends - trajectory.stamps[0]), fillcolor="#8b949e", opacity=0.25, line_width=0)
+    return figure.update_xaxes(title="time (s)", row=2)
+
+
+def _single(values: FloatArray) -> Any:
+    return np.asarray(values, np.float32)

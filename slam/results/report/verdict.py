@@ -1,0 +1,145 @@
+"""How good a run is in one sentence, what speaks for it and what raises doubt: ``metrics.json`` in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from slam.frontend.agreement import DOUBTFUL
+from slam.results.metrics import CAMERA_HEIGHTS, METRES, Metrics
+from slam.runtime.storage.record import Missing, known
+
+_FROM = {
+    "camera-height": "the camera's height over the road",
+    "lidar": "LiDAR",
+    "gps": "GPS",
+    "known": "a known distance",
+    "reference": "the truth itself, so that it is no result",
+}
+_WIDE_SPREAD, _FEW = 0.15, 0.5  # of the scale; frames that measured it over all
+_LARGEST_SCALE_ERROR = 0.03
+_SURE = 0.5
+_NOISE_POINTS = 0.12  # share of factors off the promised one
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A sentence, signs that speak for the run, and doubts."""
+
+    sentence: str
+    signs: Sequence[str]
+    doubts: Sequence[str]
+
+
+def verdict(metrics: Metrics) -> Verdict | None:
+    """What the numbers say; None of a run that did not end well."""
+    if metrics.failure:
+        return None
+    found: tuple[list[str], list[str]] = [], []
+    for part in (_confidence, _loops, _agreement, _unit, _noise, _frames, _map):
+        for is_sign, words in part(metrics):
+            found[0 if is_sign else 1].append(words)
+    confirmed = next((words for is_sign, words in _loops(metrics) if is_sign), "")
+    return Verdict(_sentence(metrics, confirmed), *found)
+
+
+def percent(share: float) -> str:
+    """A share as words, with two digits where it is small."""
+    return f"{100 * share:.2g} %" if abs(share) < 0.1 else f"{100 * share:.0f} %"
+
+
+def _sentence(metrics: Metrics, confirmed: str) -> str:
+    align, length = metrics.trajectories.optimised.align, known(metrics.sequence.length_m)
+    error = known((align.dof6 if metrics.is_metric else align.dof7).ate_rmse_m)
+    if error is None:
+        means = "its lengths are in metres" if metrics.is_metric else _no(metrics.unit)
+        sure = known(metrics.confidence.run)
+        likely = f": {percent(sure)} of drives like it err by at most 1 % of their path" if sure is not None else ""
+        return f"Without a truth its error is unknown{likely}{f', and {confirmed}' if confirmed else ''}; {means}."
+    part = f", {percent(error / length)} of its {length:.3g} m" if length else ""
+    own = "with its scale from the truth" if metrics.scale.mode == "reference" else "with its own metric scale"
+    after = own if metrics.is_metric else f"after one fitted scale; {_no(metrics.unit)}"
+    return f"The trajectory is {error:.2g} m off the truth (RMSE{part}), {after}."
+
+
+def _no(unit: str) -> str:
+    measured = "are in camera heights over the learned road, not in metres"
+    return f"its lengths {measured if unit == CAMERA_HEIGHTS else 'have no metric unit'}"
+
+
+def _unit(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    scale, frames = metrics.scale, known(metrics.sequence.frames)
+    spread, used = known(scale.spread), known(scale.frames_used)
+    if metrics.unit == METRES and (source := _FROM.get(known(scale.mode) or "")):
+        certain = f" (spread {percent(spread)})" if spread is not None else ""
+        yield scale.mode != "reference" and (spread or 0.0) < _WIDE_SPREAD, f"metres come from {source}{certain}"
+    if scale.mode in ("camera-height", "none") and used and frames and used < _FEW * frames:
+        yield False, f"only {used} of {frames} frames see a road"
+    fitted = known(metrics.trajectories.optimised.align.dof7.scale)
+    if metrics.is_metric and fitted and abs(fitted - 1.0) > _LARGEST_SCALE_ERROR:
+        yield False, f"lengths are {percent(abs(1.0 / fitted - 1.0))} too {'short' if fitted > 1.0 else 'long'}"
+
+
+def _loops(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    accepted, candidates = known(metrics.loops.accepted), known(metrics.loops.candidates)
+    if accepted:
+        yield (
+            True,
+            f"{accepted} of {_count(known(metrics.loops.verified) or accepted, 'measured loop')} agree and close it",
+        )
+    elif accepted == 0:
+        yield False, f"no loop closes it ({candidates} candidates), so drift adds up"
+    elif isinstance(metrics.loops.accepted, Missing):
+        yield False, f"drift adds up: {metrics.loops.accepted.reason}"
+
+
+def _confidence(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    sure = known(metrics.confidence.run)
+    if sure is not None:
+        yield sure > _SURE, f"{percent(sure)} of drives with images like its own err by at most 1 % of their path"
+
+
+def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    for each in known(metrics.agreement) or ():
+        sigmas = known(each.sigmas) or 0.0
+        if sigmas <= DOUBTFUL and each.beside != "the images":
+            continue  # `_confidence` says it of all
+        verb = "agrees with" if sigmas <= DOUBTFUL else "contradicts"
+        yield sigmas <= DOUBTFUL, f"{each.source} {verb} {each.beside} ({sigmas:.1f} sigmas: {known(each.figure)})"
+    off = known(metrics.gps.optimised.horizontal_rmse_m)
+    if off is not None:
+        within = "" if metrics.gps.in_graph is True else ", which it did not use"
+        yield True, f"it stays within {off:.2g} m (RMSE) of the GPS track{within}"
+
+
+def _noise(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    coverage = metrics.graph.coverage
+    inside = [known(each) for each in (coverage.inside_50, coverage.inside_90, coverage.inside_95)]
+    shares = [each for each in inside if each is not None]
+    if len(shares) == 3:
+        off = [share - promised for share, promised in zip(shares, (0.5, 0.9, 0.95))]
+        told = ", ".join(f"{100 * share:.0f}" for share in shares)
+        numbers = f"{told} % of its measurements lie inside their 50, 90, 95 % bounds"
+        worst = min(off, key=lambda each: -abs(each))
+        how = "holds" if abs(worst) < _NOISE_POINTS else "is too small" if worst < 0 else "is too large"
+        yield how == "holds", f"its stated noise {how}: {numbers}"
+
+
+def _frames(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    sequence = metrics.sequence
+    if doubled := sum(each.last - each.first + 1 for each in known(sequence.doubled) or ()):
+        yield False, f"{_count(doubled, 'frame')} repeat the one before while the camera moves"
+    if (maps := known(metrics.tracking.maps) or 1) > 1:
+        yield False, f"tracking was lost: {maps} maps are not joined"
+    if metrics.provenance.leak is True:
+        yield False, "its weights saw this sequence, or a part of it, in training"
+
+
+def _map(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+    off = known(metrics.map.accuracy_median_m)
+    if off is not None:
+        yield True, f"its map lies {off:.2g} m (median) from the true surface"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -21,6 +21,7 @@ from slam.frontend.visual.epipolar import UnitRelativePose
 
 _NEAREST = 1e-6
 _INVERSIONS = 2
+_DEPTH_WIDTH_PX = 400
 _GRID_PX = 3  # the flow is computed at every third pixel: learned depth has no finer detail
 
 
@@ -49,7 +50,18 @@ class PredictedFlow:
         return np.asarray(moved, dtype=np.float32).reshape(-1, 2)
 
     def depth_current(self) -> DepthMap:
-        """Z-depth ``(H, W)`` of the later image, of the surfaces that the earlier one shows; NaN where unknown."""
+        """Z-depth ``(H, W)`` of the later image, of the surfaces that the earlier one shows; NaN where unknown.
+
+        Of large images it is computed at about the size at which networks see them.
+        """
+        height, width = self.depth_previous.shape
+        ratio = width // _DEPTH_WIDTH_PX
+        if ratio > 1:
+            size = width // ratio, max(height // ratio, 1)
+            depth = cv2.resize(self.depth_previous, size, interpolation=cv2.INTER_NEAREST_EXACT)
+            small = PredictedFlow(self.unit_pose, self.length, np.asarray(depth), self.intrinsics.resized(*size))
+            later = small.depth_current()
+            return np.asarray(cv2.resize(later, (width, height), interpolation=cv2.INTER_NEAREST_EXACT))
         grid = _pixels(self.intrinsics)
         flow = self._current - grid
         before = grid - flow

@@ -17,7 +17,8 @@ class BenchmarkSequence:
 
     ``sequence`` is empty for a root that is one recording.
 
-    Drives of one ``kind`` are a row of the summary; ``clean`` names the same drive without hazards.
+    Drives of one ``kind`` are a row of the summary; ``clean`` names the same drive without hazards. ``truth`` is the
+    file of its true poses, where it does not hold them itself.
     """
 
     name: str
@@ -27,6 +28,7 @@ class BenchmarkSequence:
     simulate: tuple[str, ...] = ()
     kind: str = ""
     clean: str = ""
+    truth: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,7 @@ class Job:
         words += ["--sequence", drive.sequence] if drive.sequence else []
         words += ["--seed", str(self.seed), "--device", self.device, "--output", str(self.place / "run")]
         words += ["--frames", drive.frames] if drive.frames else []
+        words += ["--truth", str(drive.truth)] if drive.truth else []
         words += ["--cache", str(self.cache)] if configuration.cache else []
         return words + [word for override in configuration.overrides for word in ("--set", override)]
 

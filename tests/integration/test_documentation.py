@@ -88,6 +88,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/commands/calibration renders them"),
     (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_many_view_truth.py has a short one"),
     (r"benchmark.py full-size ", "it wants images at the size of KITTI's cameras, and half an hour"),
+    (r"benchmark.py handheld ", "it wants data sets, or minutes a room; tests/tools/test_handheld.py has tiny folders"),
     (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
     (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/live has folders and videos that go on"),
     (r"slam_node.py", "rclpy is on no package index; tests/slam/commands/live runs its callbacks"),

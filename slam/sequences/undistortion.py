@@ -164,12 +164,17 @@ def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[Ima
             f"{camera.width}x{camera.height}: {wanted}"
         )
     if not camera.is_distorted:
-        return images, replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3)
+        return images, pinhole_of(camera)
     try:
         undistortion = Undistortion(camera)
     except SequenceError as error:
         raise SequenceError(f"{where}: {error}") from error
     return UndistortedImages(images, undistortion), undistortion.intrinsics
+
+
+def pinhole_of(camera: CameraFile) -> Intrinsics:
+    """The camera of images without distortion."""
+    return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3)
 
 
 def _scaled_hint(camera: CameraFile, width: int, height: int) -> str:

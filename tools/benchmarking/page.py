@@ -118,7 +118,7 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
         "failed": lambda group: str(sum(bool(o.reason) for o in group)),
         "mean ATE 7-dof (m)": m.average(handheld.ATE),
         "ATE, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
-        "losses in all": lambda group: f"{sum(found):.0f}" if (found := values(group, handheld.LOSSES)) else DASH,
+        "losses in all": lambda group: f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH,
         "frames before the first map": m.middle_and_extreme(handheld.FIRST_MAP, max),
         "before a new map": m.middle_and_extreme(handheld.NEW_MAP, max),
         "share of frames located": m.middle_and_extreme(handheld.LOCATED, min),

@@ -1,7 +1,8 @@
 """Accuracy and speed: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
 
 accuracy measures simulated worlds and KITTI sequences, full-size the same worlds and KITTI at the size of KITTI's
-cameras, ablation turns off one part at a time, maps the errors of the map with one of its parts turned off at a time.
+cameras, ablation turns off one part at a time, maps the errors of the map with one of its parts turned off at a time,
+handheld cameras that are carried: data sets beside published marks, folders of images, simulated rooms.
 Every run is a process and a folder of its own under --output. A successful one is not repeated as long as sources,
 weights and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its reason.
 --jobs and --scheduler need Dask: pip install 'erfsfm-slam[cluster]'. A scheduler's workers need the same files at the
@@ -24,9 +25,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from benchmarking import kitti, pairs
+from benchmarking import handheld, kitti, pairs
 from benchmarking.metrics import rows
-from benchmarking.page import PICTURE, draw, drawable, section, speed_section, summary_table, with_section
+from benchmarking.page import (
+    PICTURE,
+    draw,
+    drawable,
+    handheld_summary,
+    section,
+    speed_section,
+    summary_table,
+    with_section,
+)
 from benchmarking.plan import (
     ABLATION,
     ACCURACY,
@@ -62,6 +72,7 @@ class Mode:
 
 
 _BOTH = ("loop", "straight")
+_ROOTS = ("kitti", "data", *handheld.ROOTS)  # options of data sets, which the page calls by these names
 MODES = {
     "accuracy": Mode(
         "errors of network, odometry and optimised trajectory on every sequence",
@@ -75,6 +86,7 @@ MODES = {
     "ablation": Mode("the same with one part turned off at a time", ABLATION, _BOTH, weights=("default", "sim")),
     "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", MAPS, ("loop",)),
     "kitti": Mode("whole sequences of KITTI odometry, beside published errors", WHOLE, (), weights=("sim",)),
+    "handheld": Mode("errors, losses and waits of cameras that are carried", ACCURACY, ()),
 }
 
 
@@ -89,17 +101,17 @@ def main(words: Sequence[str] | None = None) -> None:
     scheduler = getattr(options, "scheduler", None)
     jobs = _whole_sequences(options) if options.mode == "kitti" else _jobs(options)
     if not jobs:
-        raise SystemExit("nothing to measure: give --routes or --kitti")
+        raise SystemExit("nothing to measure: give --routes or a recording; see --help")
     with workers(at_a_time, scheduler) as spread:
         results = measured(jobs, spread)
-    table_of_runs = rows(results)
+    table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
     with (options.output / f"{options.mode}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table_of_runs[0])
         writer.writeheader()
         writer.writerows(table_of_runs)
-    drives = [(path, "DRIVE") for path in getattr(options, "drives", ())]
+    drives = [(path, "DRIVE") for name in ("drives", "folders") for path in getattr(options, name, ())]
     text = section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
-    roots = (getattr(options, "kitti", None), "KITTI"), (getattr(options, "data", None), "DATA")
+    roots = [(getattr(options, name, None), name.upper()) for name in _ROOTS]
     known = (options.output, "OUTPUT"), (getattr(options, "worlds_in", None), "WORLDS"), *roots, (ROOT, "."), *drives
     for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
@@ -108,6 +120,8 @@ def main(words: Sequence[str] | None = None) -> None:
         print(summary_table(results))
     if options.mode == "kitti":
         print(kitti.tables(results))
+    if options.mode == "handheld":
+        print(handheld_summary(results))
     if options.mode == "accuracy" and drawable(results):
         draw(results, options.report.parent / PICTURE)
     print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
@@ -149,7 +163,10 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     simulated = (options.worlds_in or options.output / "worlds").resolve()
     truth: tuple[Literal["depth"], ...] = ("depth",) if options.mode == "maps" else ()
     size = FULL_SIZE if options.mode == "full-size" else None
-    drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth, size)
+    if options.mode == "handheld":
+        drives = handheld.drives(options, simulated)
+    else:
+        drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth, size)
     drives += raw_drives(getattr(options, "drives", ()))
     if getattr(options, "kitti", None) is not None:
         drives += recordings(options.kitti.resolve(), options.sequences, options.excerpt)
@@ -184,11 +201,16 @@ def _command(options: argparse.Namespace) -> str:
     """The command with its defaults, without the paths and hosts of one machine."""
     words = ["python", "tools/benchmark.py", options.mode]
     words += [
-        word for name in ("kitti", "data") if getattr(options, name, None) for word in (f"--{name}", name.upper())
+        word
+        for name in _ROOTS
+        if getattr(options, name, None)
+        for word in (f"--{name.replace('_', '-')}", name.upper())
     ]
     drives = getattr(options, "drives", ())
     names = [f"KITTI_RAW/{drive.resolve().parent.name}/{drive.name}" for drive in drives]
     words += ["--drives", *names] if names else []
+    folders = [f"DATA/{folder.resolve().parent.name}/{folder.name}" for folder in getattr(options, "folders", ())]
+    words += ["--folders", *folders] if folders else []
     for name in (
         "weights",
         "routes",
@@ -200,6 +222,11 @@ def _command(options: argparse.Namespace) -> str:
         "excerpt",
         "seeds",
         "device",
+        "rooms",
+        "motions",
+        "rates",
+        "hazards",
+        "seconds",
         "set",
     ):
         value = getattr(options, name, None)
@@ -218,10 +245,13 @@ def _parser() -> argparse.ArgumentParser:
         if name == "full-size":
             data = os.environ.get("ERFSFM_DATA")
             add("--data", type=Path, default=data and Path(data), metavar="FOLDER", help="recordings; $ERFSFM_DATA")
-        else:
+        elif name != "handheld":
             add("--kitti", type=Path, metavar="ROOT", required=name == "kitti", help="a KITTI odometry root to measure")
             add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
-        if name != "kitti":
+        if name == "handheld":
+            handheld.add_options(add)
+            add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
+        elif name != "kitti":
             _add_worlds(add, mode)
         add("--weights", nargs="+", default=mode.weights, help="names or folders")
         add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")

@@ -16,6 +16,7 @@ from erfsfm.inference import record_of_whole_weights
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
+from slam.sequences.truth import poses_beside
 
 IMPORTED = {
     "numpy": "numpy",
@@ -124,7 +125,6 @@ def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:
 
 
 def _unused_truth(root: Path) -> str:
-    """How to use a file of poses that lies in or beside a recording: nothing tells whose they are."""
-    places = (root, root.absolute().parent) if root.is_dir() else (root.absolute().parent,)
-    found = next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)
+    """How to use a file of poses that lies in or beside a recording."""
+    found = poses_beside(root)
     return "" if found is None else f" (--truth {found} gives some)"

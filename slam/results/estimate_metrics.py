@@ -192,6 +192,7 @@ def _tracking(result: Estimate) -> TrackingMetrics | Missing:
     return TrackingMetrics(
         keyframes=sum(len(segment.map.keyframes) for segment in drive.maps),
         maps=len(set(drive.map_poses.segments.values())),
+        located_frames=len(drive.map_poses.segments),
         events=[Event(**asdict(event)) for event in drive.events],
     )
 

@@ -201,10 +201,11 @@ class Event(Record):
 
 
 class TrackingMetrics(Record):
-    """Keyframes and their maps."""
+    """Keyframes and their maps, and the number of frames that have a pose in one."""
 
     keyframes: Known[Count] = MISSING
     maps: Known[Count] = MISSING
+    located_frames: Known[Count] = MISSING
     events: Known[list[Event]] = MISSING
 
 

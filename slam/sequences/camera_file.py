@@ -92,15 +92,17 @@ def own_camera(own: Callable[[], CameraFile], asked: Path | None, images: Sized,
         own: reads that calibration; not called where the user gave another.
         asked: what the user gave in its place.
         images: the images.
-        folders: where a ``camera.yaml`` may lie; it gives the height of the camera alone.
+        folders: where a ``camera.yaml`` may lie; it gives the height of the camera and its read-out alone.
 
     Raises:
         SequenceError: if a camera file is wrong.
     """
     if asked is not None:
         return explicit_camera(asked, images)
-    camera, height = own(), beside(*folders)
-    return camera if height is None else camera.model_copy(update={"camera_height_m": height.camera_height_m})
+    camera, found = own(), beside(*folders)
+    if found is None:
+        return camera
+    return camera.model_copy(update={"camera_height_m": found.camera_height_m, "readout_ms": found.readout_ms})
 
 
 @sequence_errors()

@@ -29,7 +29,7 @@ class SimulatedSequence(RecordedSequence):
         super().__init__(
             name,
             _Renderings(self.street),
-            Intrinsics(options.width, options.height, *focal_and_centre),
+            Intrinsics(options.width, options.height, *focal_and_centre, readout_s=options.readout_s),
             uniform_stamps(options.frames, options.rate),
             (Source(f"simulated/{options.seed}", first=None),),
             T_any_camera=np.asarray(self.street.T_world_camera, dtype=np.float64),

@@ -42,3 +42,9 @@ def take_truth(recording: object, path: Path) -> None:
         its, ours = (f"{numbers[0]:.3f} to {numbers[-1]:.3f}" for numbers in (truth.stamps, recording.stamps))
         raise SequenceError(f"--truth {path} covers {its} and the recording {ours}: bring both to the same clock")
     recording.take_truth(T_any_camera)
+
+
+def poses_beside(recording: Path) -> Path | None:
+    """A file ``poses*.txt`` in or beside a recording; nothing tells whose poses they are."""
+    places = (recording, recording.absolute().parent) if recording.is_dir() else (recording.absolute().parent,)
+    return next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)

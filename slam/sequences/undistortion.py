@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -49,8 +50,10 @@ class Undistortion:
                 100 / zoom,
                 _CHECK,
             )
+        focal = zoom * camera.fx, zoom * camera.fy
+        readout_s = camera.readout_ms / 1e3
         self.intrinsics = Intrinsics(
-            camera.width, camera.height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy, undistorted=True
+            camera.width, camera.height, *focal, camera.cx, camera.cy, undistorted=True, readout_s=readout_s
         )
         self._maps = self._look_up()
 
@@ -161,12 +164,17 @@ def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[Ima
             f"{camera.width}x{camera.height}: {wanted}"
         )
     if not camera.is_distorted:
-        return images, Intrinsics.of(camera.pinhole)
+        return images, pinhole_of(camera)
     try:
         undistortion = Undistortion(camera)
     except SequenceError as error:
         raise SequenceError(f"{where}: {error}") from error
     return UndistortedImages(images, undistortion), undistortion.intrinsics
+
+
+def pinhole_of(camera: CameraFile) -> Intrinsics:
+    """The camera of images without distortion."""
+    return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3)
 
 
 def _scaled_hint(camera: CameraFile, width: int, height: int) -> str:

@@ -91,6 +91,8 @@ def _write_records(world: SimulatedWorld, root: Path) -> None:
     camera |= {"cx": K[0, 2], "cy": K[1, 2], "fps": options.rate}
     if world.camera_height_m is not None:
         camera["camera_height_m"] = world.camera_height_m
+    if options.readout_s:
+        camera["readout_ms"] = 1e3 * options.readout_s
     write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()] + ["model: pinhole"])
     write_lines(root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)])
 

@@ -12,6 +12,7 @@ VERSION = 1  # of the worlds: the same options give the same bytes within a vers
 MOST_FRAMES = 100_000
 STREET_RATE = 10.0
 _MOST_PIXELS = 2**25
+_READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
 _RATES = (5.0, 60.0)
 
 RoomHazard = Literal["people", "exposure", "blur", "rolling-shutter", "stop"]
@@ -63,6 +64,11 @@ class SimulationOptions:
             raise SequenceError(
                 f"images must be 8 x 8 or larger, of {_MOST_PIXELS:,} pixels at most; got {self.width} x {self.height}"
             )
+
+    @property
+    def readout_s(self) -> float:
+        """The time from the first row of an image to the last: zero unless the shutter rolls."""
+        return min(_READOUT_S, 0.9 / self.rate) if "rolling-shutter" in self.hazards else 0.0
 
 
 def parse_options(

@@ -24,7 +24,6 @@ from slam.simulation.surface import Surface, place_rays
 from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
 
 STILL_S = 3.0
-READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
 _USUAL_FOV_DEG, _VARIED_FOV_DEG = 65.0, (55.0, 100.0)
 _PEOPLE, _AHEAD_S, _NEAREST_M = 6, 3.5, 0.7  # the first of them walks ahead of the camera
 _GREY = 0.4  # brightness that exposure aims at
@@ -83,9 +82,9 @@ class SimulatedRooms(SimulatedWorld):
             blurred_px = np.linalg.norm(turned, axis=1).max() * open_s * options.rate * self.K[0, 0]
             samples = int(np.clip(blurred_px / 4.0, 3, 12))
             offsets = offsets + open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
-        if "rolling-shutter" in options.hazards:
+        if options.readout_s:
             rows = (np.arange(options.height) + 0.5) / options.height - 0.5
-            offsets = offsets + min(READOUT_S, 0.9 / options.rate) * rows
+            offsets = offsets + options.readout_s * rows
         moments = self._moments(index / options.rate + offsets.ravel(), options)
         poses = self._carried.poses(np.maximum(moments, 0.0)).reshape(*offsets.shape, 4, 4)
         return poses[:, 0] if offsets.shape[1] == 1 else poses

@@ -91,6 +91,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_many_view_truth.py has a short one"),
     (r"benchmark.py full-size ", "it wants images at the size of KITTI's cameras, and half an hour"),
     (r"compare.py ", "it wants ORB-SLAM3 in an environment of its own; tests/tools/test_compare.py runs the rest"),
+    (r"benchmark.py handheld ", "it wants data sets, or minutes a room; tests/tools/test_handheld.py has tiny folders"),
     (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
     (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/live has folders and videos that go on"),
     (r"slam_node.py", "rclpy is on no package index; tests/slam/commands/live runs its callbacks"),

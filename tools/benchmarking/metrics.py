@@ -98,8 +98,8 @@ DEFINITIONS += (*MAP_ERRORS, *MAP_SIZES[1:], FUSION, MESH)
 DEFINITIONS += (RATE, MEMORY, SECONDS, TIME, CPU, COMMAND, LOAD)
 
 
-def rows(results: Sequence[JobResult]) -> list[dict[str, Any]]:
-    """One row a run for the CSV: what ran, what came out, seconds by stage."""
+def rows(results: Sequence[JobResult], definitions: Sequence[MetricDefinition] = ()) -> list[dict[str, Any]]:
+    """One row a run for the CSV: what ran, what came out, also by more ``definitions``, seconds by stage."""
     return [
         {
             "sequence": o.job.drive.name,
@@ -110,7 +110,7 @@ def rows(results: Sequence[JobResult]) -> list[dict[str, Any]]:
             "status": "failed" if o.reason else "ok",
             "reason": o.reason,
             "leak": known(o.metrics.provenance.leak),
-            **{q.key: known(q.value(o)) for q in DEFINITIONS},
+            **{q.key: known(q.value(o)) for q in (*DEFINITIONS, *definitions)},
             **{f"seconds_{slug(stage)}": known(stage_seconds(o, stage)) for stage in stages(results)},
         }
         for o in results

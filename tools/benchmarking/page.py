@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from benchmarking import kitti
+from benchmarking import handheld, kitti
 from benchmarking import metrics as m
 from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, over_seeds, table, values, weights
 from benchmarking.plan import EVERYTHING
@@ -96,12 +96,45 @@ Sizes and cost:
 {sizes}{notes(results, (*m.MAP_ERRORS, *costs))}"""
 
 
+def handheld_tables(results: Sequence[JobResult]) -> str:
+    """One row for each kind of recording beside published marks, then one for each recording."""
+    columns = {q.title: over_seeds(q) for q in (m.FRAMES, *handheld.DEFINITIONS, m.CPU)}
+    rows = {"recording": drive, "weights": weights}
+    return f"""ATE is that of the optimised trajectory, 7-dof, over all frames with a known true pose. *Losses* are
+stretches of frames without a pose in a map of keyframes. They end with a new map, or with the old one found again. A
+frame is *located* if it has a pose in a map. The first table has medians and, in brackets, the worst.
+
+{handheld_summary(results)}
+
+Every recording:
+
+{table(rows, columns, results)}{notes(results, (handheld.ATE, handheld.LOSSES, handheld.FIRST_MAP))}"""
+
+
+def handheld_summary(results: Sequence[JobResult]) -> str:
+    """One row for each kind of recording and weights."""
+    columns: dict[str, Cell] = {
+        "runs": lambda group: str(len(group)),
+        "failed": lambda group: str(sum(bool(o.reason) for o in group)),
+        "mean ATE 7-dof (m)": m.average(handheld.ATE),
+        "ATE, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
+        "losses in all": lambda group: f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH,
+        "frames before the first map": m.middle_and_extreme(handheld.FIRST_MAP, max),
+        "before a new map": m.middle_and_extreme(handheld.NEW_MAP, max),
+        "share of frames located": m.middle_and_extreme(handheld.LOCATED, min),
+        "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
+    }
+    rows = {"recordings": kind, "weights": weights, "published": lambda o: handheld.MARKS.get(kind(o), DASH)}
+    return table(rows, columns, results)
+
+
 TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
     "accuracy": accuracy_tables,
     "full-size": error_tables,
     "ablation": ablation_tables,
     "maps": maps_tables,
     "kitti": lambda results: kitti.tables(results) + notes(results, kitti.MEASURED),
+    "handheld": handheld_tables,
 }
 
 

@@ -17,7 +17,8 @@ class BenchmarkSequence:
 
     ``sequence`` is empty for a root that is one recording; ``truth`` is a file of its true poses.
 
-    Drives of one ``kind`` are a row of the summary; ``clean`` names the same drive without hazards.
+    Drives of one ``kind`` are a row of the summary; ``clean`` names the same drive without hazards. ``truth`` is the
+    file of its true poses, where it does not hold them itself.
     """
 
     name: str

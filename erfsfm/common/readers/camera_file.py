@@ -42,9 +42,12 @@ class CameraFile(BaseModel):
         default=(),
         description="opencv: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; fisheye: k1 k2 k3 k4; fov: the angle",
     )
+    readout_ms: float = Field(
+        default=0.0, ge=0, description="time from the first row of an image to the last, milliseconds (rolling shutter)"
+    )
     source: str | None = Field(default=None, description="a note on where the numbers come from")
 
-    @field_validator("width", "height", "fx", "fy", "cx", "cy", "fps", "camera_height_m", mode="before")
+    @field_validator("width", "height", "fx", "fy", "cx", "cy", "fps", "camera_height_m", "readout_ms", mode="before")
     @classmethod
     def _refuse_truth(cls, value: Any) -> Any:
         if isinstance(value, bool):
@@ -56,6 +59,10 @@ class CameraFile(BaseModel):
         height_m = self.camera_height_m
         if not isinstance(height_m, str | None) and not 0 < height_m <= HIGHEST_M:
             raise ValueError(f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}")
+        if self.readout_ms > 1e3 / self.fps:
+            raise ValueError(
+                f"readout_ms: a frame is read before the next, within {1e3 / self.fps:g} ms; is {self.readout_ms:g}"
+            )
         problem = impossible(self.pinhole)
         if problem is not None:
             raise ValueError(problem)

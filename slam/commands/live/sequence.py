@@ -14,7 +14,7 @@ from slam.frames import Frame, Image, Intrinsics
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.growing import GrowingSequence
-from slam.sequences.undistortion import Undistortion
+from slam.sequences.undistortion import Undistortion, pinhole_of
 
 
 class StreamedSequence(GrowingSequence):
@@ -45,7 +45,7 @@ class StreamedSequence(GrowingSequence):
     @staticmethod
     def intrinsics_of(camera: CameraFile) -> Intrinsics:
         """Of the images without distortion."""
-        return Undistortion(camera).intrinsics if camera.is_distorted else Intrinsics.of(camera.pinhole)
+        return Undistortion(camera).intrinsics if camera.is_distorted else pinhole_of(camera)
 
     def frames(self) -> Iterator[Frame]:
         """Every frame as it is taken."""

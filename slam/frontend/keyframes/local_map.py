@@ -43,6 +43,7 @@ _ADJUSTED = 10  # number of the last keyframes that are adjusted
 class TrackedKeyframe:
     """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
 
+    ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the middle row.
     ``learned_depth`` ``(M,)`` is NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once the image is
     not kept any more.
     """
@@ -51,13 +52,14 @@ class TrackedKeyframe:
     T_camera_world: FloatArray
     track_ids: TrackIds
     pixels: FloatArray
+    places: FloatArray
     learned_depth: FloatArray
     descriptors: Descriptors
     grey: Grey | None
 
     def with_depth(self, depth: DepthMap) -> TrackedKeyframe:
         """The same with learned depth ``(H, W)`` at its corners."""
-        return replace(self, learned_depth=nearest_depth(depth, self.pixels))
+        return replace(self, learned_depth=nearest_depth(depth, self.places))
 
     def without(self, gone: TrackIds) -> TrackedKeyframe:
         """The same without some tracks."""
@@ -69,6 +71,7 @@ class TrackedKeyframe:
             self,
             track_ids=track_ids[rows],
             pixels=self.pixels[rows],
+            places=self.places[rows],
             learned_depth=self.learned_depth[rows],
             descriptors=self.descriptors[rows],
         )
@@ -254,6 +257,6 @@ def _matched(
     H = intrinsics.K @ R_camera_keyframe @ np.linalg.inv(intrinsics.K)
     size = intrinsics.width, intrinsics.height
     turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-    moved = np.column_stack([keyframe.pixels[rows], np.ones(len(rows))]) @ H.T
+    moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
     pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
     return flow(turned, grey, pixels, guesses, _MATCHED_LEVELS)

@@ -21,6 +21,7 @@ from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import Thumbnail, flow, image_shift, new_corners
 from slam.frontend.keyframes.initialisation import View, first_points
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
 from slam.geometry.se3 import FloatArray, invert
@@ -74,6 +75,8 @@ class KeyframeOdometryState:
     T_camera_world: FloatArray = field(default_factory=lambda: np.eye(4))
     T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
     lost: int = 0
+    stamp: float = 0.0
+    turn: FloatArray = field(default_factory=lambda: np.zeros(3))  # a second, where the shutter rolls
     thumbnail: Thumbnail = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
 
@@ -143,16 +146,19 @@ class KeyframeOdometry:
         segment = state.segments[-1]
         state.T_camera_world, state.T_last_step, state.lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
+        pixels = in_middle_row(pixels, state.turn, self._intrinsics)
         segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
         shift, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
+        since, self._state.stamp = frame.stamp - self._state.stamp, frame.stamp
         if not self._state.segments or self._state.lost > _MAX_LOST_FRAMES:
             self._begin(frame)
             return
         segment = self._state.segments[-1]
         track_ids, pixels = self._track(segment, frame, shift)
+        self._measure_turn(segment, track_ids, pixels, since)
         if segment.started:
             self._locate(segment, frame, track_ids, pixels)
         else:
@@ -196,7 +202,7 @@ class KeyframeOdometry:
         found, kept = flow(
             keyframe.grey,
             frame.grey,
-            keyframe.pixels[rows].astype(np.float32),
+            keyframe.places[rows].astype(np.float32),
             guesses,
             _PYRAMID_LEVELS,
         )
@@ -210,6 +216,7 @@ class KeyframeOdometry:
         if len(track_ids) < _LEAST_START_TRACKS:
             self._begin(frame)
             return
+        places, pixels = pixels, in_middle_row(pixels, self._state.turn, intrinsics)
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, 0))
         rows = np.searchsorted(first.track_ids, track_ids)
         rays_first, rays = intrinsics.rays(first.pixels[rows]), intrinsics.rays(pixels.astype(np.float64))
@@ -226,12 +233,13 @@ class KeyframeOdometry:
             before.map.forget_images()
         self._note(frame.index, "map begun", support=int(found.solid.sum()))
         self._state.T_camera_world = found.T_current_first
-        self._add_keyframe(segment, frame, track_ids, pixels)
+        self._add_keyframe(segment, frame, track_ids, places)
         segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
 
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """The camera's pose from known points."""
         state, known = self._state, segment.map.known(track_ids)
+        places, pixels = pixels, in_middle_row(pixels, state.turn, self._intrinsics)
         pose = self._resected(segment, track_ids[known], pixels[known]) if known.any() else None
         if pose is None:
             state.lost += 1
@@ -244,9 +252,9 @@ class KeyframeOdometry:
         slipped = track_ids[known][pose.residual_px > _SLIPPED * INLIER_PX]
         state.slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
-        track_ids, pixels = track_ids[kept], pixels[kept]
+        track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
         if self._wants_keyframe(segment, track_ids, pixels):
-            self._add_keyframe(segment, frame, track_ids, pixels)
+            self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
 
     def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
@@ -287,12 +295,13 @@ class KeyframeOdometry:
         unknown = np.full(len(track_ids), np.nan)
         if segment.started and len(local.keyframes) == 1:
             self._add_first_keyframes(segment)
-        local.add(TrackedKeyframe(frame.index, T, track_ids, places, unknown, describe(frame.grey, places), frame.grey))
+        middle, descriptors = in_middle_row(places, state.turn, intrinsics), describe(frame.grey, places)
+        local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
         if segment.started:
             local.triangulate(intrinsics)
             local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
             state.T_camera_world = local.keyframes[-1].T_camera_world
-        state.places = local.keyframes[-1].pixels.astype(np.float32)
+        state.places = local.keyframes[-1].places.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
 
     def _add_first_keyframes(self, segment: MapSegment) -> None:
@@ -307,8 +316,16 @@ class KeyframeOdometry:
             places = frame.pixels.astype(np.float64)
             first = segment.map.keyframes[0]
             same = first.descriptors[np.searchsorted(first.track_ids, frame.track_ids)]
-            keyframe = TrackedKeyframe(frame.index, pose.T_camera_world, frame.track_ids, places, unknown, same, None)
-            segment.map.add(keyframe)
+            T = pose.T_camera_world
+            segment.map.add(TrackedKeyframe(frame.index, T, frame.track_ids, places, places, unknown, same, None))
+
+    def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
+        """How fast the camera turns, for a rolling shutter."""
+        if not self._intrinsics.readout_s:
+            return
+        before = segment.frames[-1] if segment.frames else segment.map.keyframes[-1]
+        _, a, b = np.intersect1d(before.track_ids, track_ids, assume_unique=True, return_indices=True)
+        self._state.turn = measured_turn(before.pixels[a], pixels[b], seconds, self._state.turn, self._intrinsics)
 
     def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
         """Keep an event and log it."""

@@ -150,3 +150,8 @@ def test_scans_are_refused_before_anything_is_written(walk: SimulatedRooms, tmp_
     with pytest.raises(SequenceError, match="no LiDAR is carried through rooms"):
         write_kitti_root(walk, tmp_path / "world", lidar=True)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_root_says_how_long_its_rolling_shutter_takes(tmp_path: Path) -> None:
+    write_kitti_root(rooms(4, rate=30.0, hazards=("rolling-shutter",)), tmp_path / "world")
+    assert open_sequence(tmp_path / "world").intrinsics.readout_s == 0.025

@@ -47,6 +47,7 @@ def test_exponent_without_dot_is_a_number(tmp_path: Path, camera_yaml: str) -> N
         ("{yaml}focal: 3\n", "key focal is unknown"),
         ("{yaml}camera_height_m: -1\n", "camera_height_m: must be greater than 0, to 1000"),
         ("{yaml}camera_height_m: yes\n", "camera_height_m: wanted a number, is True"),
+        ("{yaml}readout_ms: 201\n", "readout_ms: a frame is read before the next, within 200 ms; is 201"),
         ("{yaml}model: omni\n", "model: input should be 'pinhole', 'opencv', 'fisheye' or 'fov', is 'omni'"),
         ("{yaml}distortion: [0.1, 0, 0, 0]\n", "distortion: needs model opencv, fisheye or fov"),
         (

@@ -1,0 +1,168 @@
+"""Cameras that are carried: public data sets, folders of images, simulated rooms; losses, waits and located frames."""
+
+from __future__ import annotations
+
+import functools
+from argparse import Namespace
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from benchmarking.metrics import MetricDefinition
+from benchmarking.plan import BenchmarkSequence
+from benchmarking.work import JobResult
+
+from slam.evaluation.trajectory import trajectory_metrics
+from slam.formats.trajectory import Trajectory
+from slam.results.folder import RunFolder
+from slam.results.metrics import Event
+from slam.runtime.storage.record import Missing
+from slam.sequences.catalogue import open_sequence, sequence_kinds
+from slam.sequences.poses import known_poses
+from slam.sequences.recording import RecordedSequence
+from slam.sequences.truth import poses_beside
+from slam.simulation.motion import Motion
+from slam.simulation.options import VERSION, RoomHazard
+
+RoomCondition = Literal["clean"] | RoomHazard
+_CONDITIONS: tuple[RoomCondition, ...] = ("clean", "people", "exposure", "blur", "rolling-shutter")
+SEEDS = tuple(range(730, 740))  # used for nothing else
+SIZE = 640, 480  # pixels of a room's images
+ROOTS = {"tum": "TUM RGB-D", "seven_scenes": "7-Scenes", "euroc": "EuRoC"}  # options, and the kinds that they name
+MARKS = {
+    "TUM RGB-D": "fr1: 0.030 m on average (MASt3R-SLAM, calibrated, on a GPU); ORB-SLAM3 loses five of nine",
+    "7-Scenes": "seq-01: 0.049 m on average; the reference itself is 0.014 to 0.15 m off COLMAP's",
+    "EuRoC": "MH01 to MH05: 0.021 to 0.100 m (ORB-SLAM3)",
+}
+
+
+def add_options(add: Callable[..., Any]) -> None:
+    """The options that say what is measured."""
+    for option, kind in ROOTS.items():
+        add(f"--{option.replace('_', '-')}", type=Path, metavar="ROOT", help=f"{kind}: all of its sequences")
+    add("--folders", nargs="+", type=Path, default=(), metavar="FOLDER", help="of images; truth: poses*.txt beside it")
+    add("--rooms", nargs="*", type=int, metavar="SEED", help="simulated rooms; without numbers 730 to 739")
+    add("--motions", nargs="+", choices=get_args(Motion), default=("walk", "phone"), help="through each of the rooms")
+    add("--rates", nargs="+", type=int, default=(10, 30), help="frames a second")
+    conditions = "clean", *get_args(RoomHazard)
+    add("--hazards", nargs="+", choices=conditions, default=_CONDITIONS, help="one at a time")
+    add("--seconds", type=int, default=30, help="length of a walk")
+
+
+def drives(options: Namespace, folder: Path) -> list[BenchmarkSequence]:
+    """Everything that the options name; rooms are made in ``folder`` where they are missing."""
+    found = []
+    for option, kind in ROOTS.items():
+        root = getattr(options, option)
+        if root is not None:
+            names = [name for name, its in sequence_kinds(root).items() if its == kind]
+            if not names:
+                raise SystemExit(f"no sequence of {kind} in {root}: give the folder that holds them")
+            found += [BenchmarkSequence(f"{kind} {name}", root.resolve(), name, kind=kind) for name in names]
+    for path in options.folders:
+        root = path.resolve()
+        name = root.parent.name
+        found.append(BenchmarkSequence(name, root, "", kind=name, truth=poses_beside(root)))
+    seeds = () if options.rooms is None else options.rooms or SEEDS
+    found += [
+        _room(folder, seed, motion, rate, hazard, options.seconds * rate)
+        for hazard in options.hazards
+        for rate in options.rates
+        for motion in options.motions
+        for seed in seeds
+    ]
+    return found
+
+
+def _room(
+    folder: Path, seed: int, motion: Motion, rate: int, condition: RoomCondition, frames: int
+) -> BenchmarkSequence:
+    width, height = SIZE
+    words = ["--route", "rooms", "--seed", str(seed), "--frames", str(frames), "--motion", motion, "--rate", str(rate)]
+    words += ["--width", str(width), "--height", str(height)]
+    name, kind = f"rooms {seed}, {motion}, {rate} Hz", f"rooms, {rate} Hz"
+    place = f"rooms-{seed}-{motion}-{rate}-{frames}-{condition}-v{VERSION}"
+    if condition == "clean":
+        return BenchmarkSequence(name, folder / place, simulate=tuple(words), kind=kind)
+    words += ["--hazards", condition]
+    title, kind = f"{name}, {condition}", f"{kind}, {condition}"
+    return BenchmarkSequence(title, folder / place, simulate=tuple(words), kind=kind, clean=name)
+
+
+@functools.cache
+def _error_and_path(run: Path, drive: BenchmarkSequence) -> tuple[float | Missing, float | Missing]:
+    """7-dof ATE of the optimised trajectory, and the path, by those frames whose true pose is known, metres."""
+    sequence = open_sequence(drive.root, drive.sequence or None, truth=drive.truth)
+    poses = sequence.T_any_camera if isinstance(sequence, RecordedSequence) else None
+    known = np.zeros(0, np.intp) if poses is None else np.flatnonzero(known_poses(poses))
+    estimate = RunFolder(run).trajectory("optimised")
+    if poses is None or estimate is None or not len(known):
+        return Missing("it has no true poses"), Missing("it has no true poses")
+    truth = Trajectory(sequence.stamps[known], poses[known]).rebased()
+    ate: float | Missing = trajectory_metrics(estimate.select(known).rebased(), truth).align.dof7.ate_rmse_m
+    return ate, truth.length_m
+
+
+def _ate(o: JobResult) -> float | Missing:
+    return _error_and_path(o.job.place / "run", o.job.drive)[0] if not o.reason else Missing(o.reason)
+
+
+def _path(o: JobResult) -> float | Missing:
+    return _error_and_path(o.job.place / "run", o.job.drive)[1] if not o.reason else Missing(o.reason)
+
+
+def _percent(o: JobResult) -> float | Missing:
+    ate, path = _ate(o), _path(o)
+    if isinstance(ate, Missing) or isinstance(path, Missing):
+        return ate
+    return 100.0 * ate / path if path else Missing("the camera does not move")
+
+
+def _events(o: JobResult) -> Sequence[Event] | Missing:
+    events: Sequence[Event] | Missing = o.metrics.tracking.events
+    return events
+
+
+def losses(o: JobResult) -> int | Missing:
+    """How often the camera was lost."""
+    events = _events(o)
+    return events if isinstance(events, Missing) else sum(each.event == "lost" for each in events)
+
+
+def first_map(o: JobResult) -> int | Missing:
+    """Number of frames before the first map."""
+    events = _events(o)
+    if isinstance(events, Missing):
+        return events
+    return next((each.frame for each in events if each.event == "map begun"), Missing("no map began"))
+
+
+def longest_wait(o: JobResult) -> int | Missing:
+    """Most frames from a loss until the camera was found again, or a new map began, or the recording ended."""
+    events, frames = _events(o), o.metrics.sequence.frames
+    if isinstance(events, Missing):
+        return events
+    if isinstance(frames, Missing):
+        return frames
+    lost = [each.frame for each in events if each.event == "lost"]
+    found = [each.frame for each in events if each.event in ("map begun", "relocalised")]
+    waits = [min((frame for frame in found if frame > start), default=frames) - start for start in lost]
+    return max(waits, default=Missing("the camera was never lost"))
+
+
+def _located(o: JobResult) -> float | Missing:
+    located, frames = o.metrics.tracking.located_frames, o.metrics.sequence.frames
+    if isinstance(located, Missing):
+        return located
+    return frames if isinstance(frames, Missing) else located / frames
+
+
+ATE = MetricDefinition("ate_7dof_known_m", "ATE 7-dof (m)", _ate, 3)
+PATH = MetricDefinition("path_known_m", "path (m)", _path, 1)
+PERCENT = MetricDefinition("ate_7dof_known_percent", "% of path", _percent, 2)
+LOSSES = MetricDefinition("losses", "losses", losses, 0)
+FIRST_MAP = MetricDefinition("frames_before_first_map", "frames before the first map", first_map, 0)
+NEW_MAP = MetricDefinition("frames_before_new_map", "most frames before a new map", longest_wait, 0)
+LOCATED = MetricDefinition("located_share", "share of frames located", _located, 3)
+DEFINITIONS = (ATE, PATH, PERCENT, LOSSES, FIRST_MAP, NEW_MAP, LOCATED)

@@ -288,7 +288,7 @@ def drive_street(
 ) -> Estimate:
     oracle = OraclePredictor(
         street.reference,
-        lambda k: np.where((depth := street.base.street.render(street.start + k).depth) > 0, depth, sky),
+        lambda k: np.where((depth := street.base.street.depth(street.start + k)) > 0, depth, sky),
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
@@ -338,7 +338,7 @@ def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
 def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt) -> None:
     """In camera heights, which are no metres; depth of the sky is unknown."""
     result = drive_street(street, mode="none", sky=np.nan)
-    depths = [street.base.street.render(street.start + k).depth for k in range(0, 25, 6)]
+    depths = [street.base.street.depth(street.start + k) for k in range(0, 25, 6)]
     nearness = np.median([np.median(depth[depth > 0]) for depth in depths]) / street.camera_height_m
     assert result.map is not None
     assert result.map.voxel_size == pytest.approx(0.2 * nearness / 15.0, rel=0.15)

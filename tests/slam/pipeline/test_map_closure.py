@@ -1,3 +1,4 @@
+import functools
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,6 +50,14 @@ def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> Keyfr
     return odometry.state()
 
 
+@functools.cache
+def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometryState]:
+    """Two maps, and the true poses; on the way back the camera is rolled and closer."""
+    walked = there_and_back(110, roll=0.4, closer=0.3)
+    truth = np.concatenate([walked[:30], walked[48:]])
+    return truth, tracked(truth, [0] * 30 + [9] * 11 + [0] * 51)
+
+
 def closed(state: KeyframeOdometryState) -> MapClosure:
     return close_maps(state.segments, room.INTRINSICS, CONFIG)
 
@@ -71,9 +80,7 @@ def errors(found: KeyframePoses, truth: FloatArray) -> tuple[float, float]:
 
 
 def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_closer() -> None:
-    walked = there_and_back(110, roll=0.4, closer=0.3)
-    truth = np.concatenate([walked[:30], walked[48:]])
-    state = tracked(truth, [0] * 30 + [9] * 11 + [0] * 51)
+    truth, state = lost_on_the_way()
     assert sum(segment.started for segment in state.segments) == 2
     assert [event.event for event in state.events] == ["map begun", "lost", "map begun"]
     after = closed(state)
@@ -165,8 +172,8 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
 
 def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(maps, "OF_KEYFRAMES", replace(maps.OF_KEYFRAMES, min_support=99, alone_inliers=10_000))
-    truth = np.concatenate([there_and_back(110, roll=0.4, closer=0.3)[rows] for rows in (slice(30), slice(48, 110))])
-    after = closed(tracked(truth, [0] * 30 + [9] * 11 + [0] * 51))
+    truth, state = lost_on_the_way()
+    after = closed(state)
     unit = MeasurementFailure("no road")
     loops = after.closures(Scale("none", unit, np.full(len(truth), 3.0), {}, "the networks' own unit"))
     measured = [loop for loop in loops.rejected if loop.T_from_to is not None]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 
@@ -13,6 +15,7 @@ FAR, NEAR = 4.0, 1.8
 _PX_PER_M = 120.0
 
 
+@functools.cache
 def texture(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = rng.integers(0, 255, (100, 130), np.uint8)

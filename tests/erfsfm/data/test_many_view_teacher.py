@@ -23,7 +23,7 @@ SIZE = (64, 208)
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     root = tmp_path_factory.mktemp("world")
-    write_kitti_root(SimulatedStreet(SimulationOptions(frames=28, seed=704, route="straight")), root / "world")
+    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 28, 704, 312, 96)), root / "world")
     return discover(root / "world")[0]
 
 

@@ -241,17 +241,20 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
 
 
 @pytest.mark.parametrize("moment", ["in a step", "in the second checkpoint"])
-def test_killed_and_resumed_ends_with_identical_weights(both: Configure, tmp_path: Path, moment: str) -> None:
+def test_killed_and_resumed_ends_with_identical_weights(
+    both: Configure, drives: Path, tmp_path: Path, moment: str
+) -> None:
     """``kill -9``: no clean-up, and half a checkpoint may be on the disk."""
     config = both(training={"steps": 6, "learning_rate": 1e-3})
-    train(config, tmp_path / "whole", device="cpu")
+    if not (drives / "whole").exists():
+        train(config, drives / "whole", device="cpu")
     victim = multiprocessing.get_context("fork").Process(target=die, args=(config, tmp_path / "cut", moment))
     victim.start()
     victim.join(120)
     assert victim.exitcode == -signal.SIGKILL
     train(config, tmp_path / "cut", resume=True, device="cpu")
-    assert same(tmp_path / "whole" / "last", tmp_path / "cut" / "last")
-    assert same(tmp_path / "whole", tmp_path / "cut")
+    assert same(drives / "whole" / "last", tmp_path / "cut" / "last")
+    assert same(drives / "whole", tmp_path / "cut")
 
 
 def die(config: ExperimentConfig, output: Path, moment: str) -> None:

@@ -41,21 +41,12 @@ def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> Float
     return from_rotation_vector(turns, centres)
 
 
-def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometryState:
-    odometry = KeyframeOdometry(CONFIG.keyframes, room.INTRINSICS)
-    for k, T in enumerate(T_world_camera):
-        frame = room.frame(k, T, 0 if seeds is None else seeds[k])
-        odometry.follow(frame)
-        odometry.learn(frame, room.depth_map(T))
-    return odometry.state()
-
-
 @functools.cache
 def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometryState]:
     """Two maps, and the true poses; on the way back the camera is rolled and closer."""
     walked = there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:30], walked[48:]])
-    return truth, tracked(truth, [0] * 30 + [9] * 11 + [0] * 51)
+    return truth, room.tracked(CONFIG.keyframes, truth, [0] * 30 + [9] * 11 + [0] * 51)
 
 
 def closed(state: KeyframeOdometryState) -> MapClosure:
@@ -112,7 +103,7 @@ def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(monkey
     monkeypatch.setattr(map_closure, "find_map_loops", find)
     back, closer = there_and_back(90, roll=0.02), there_and_back(110, roll=0.5, closer=0.3)
     truth = np.concatenate([back, back[:6], closer[95:]])
-    after = closed(tracked(truth, [0] * 90 + [9] * 6 + [0] * 15))
+    after = closed(room.tracked(CONFIG.keyframes, truth, [0] * 90 + [9] * 6 + [0] * 15))
     assert [event.event for event in after.joins] == ["map joined"]
     assert errors(after.poses, truth)[0] < 0.01
 
@@ -193,7 +184,7 @@ def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.Monk
 @pytest.mark.slow
 def test_another_scene_is_no_loop() -> None:
     walked = there_and_back(110)
-    after = closed(tracked(np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
+    after = closed(room.tracked(CONFIG.keyframes, np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
     assert after.loops == ()
     assert after.joins == ()
     assert len(set(after.poses.segments.values())) == 2

@@ -26,7 +26,7 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.lock import FolderLock
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
-from erfsfm.common.threads import stay_single_threaded
+from erfsfm.common.threads import limit_library_threads, stay_single_threaded
 from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
@@ -230,7 +230,7 @@ class ManyViewTeacher:
         return TeacherStructure(drive.motion(first, sources), least, most)
 
     def prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
-        """Compute what is not there yet, in as many processes as there are cores.
+        """Compute what is not there yet, in as many processes as there are cores; a few labels in this one.
 
         Of several programs with one folder (the processes of a training on several devices) one computes and the
         others wait for it.
@@ -255,6 +255,11 @@ class ManyViewTeacher:
         tasks = [(drive, chunk) for drive in drives for chunk in _missing(drive, sources)]
         total, done = sum(len(chunk) for _, chunk in tasks), 0
         if not tasks:
+            return
+        if len(tasks) == 1 and self._guess is None:  # a process would take longer to start
+            ((drive, chunk),) = tasks
+            with limit_library_threads():
+                progress("teacher: depth", drive.measure_labels(chunk), total)
             return
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,6 +143,19 @@ def write_raw() -> Callable[..., Path]:
         return home
 
     return write
+
+
+# rows of the paper's tables that differ in the size of images alone, or repeat another table's, count once
+_CONFIGURATIONS = {
+    re.sub(r"-\d+x\d+$|^table3-depthnet-|^table1-", "", path.stem): path.stem
+    for path in sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
+}
+
+
+@pytest.fixture(params=_CONFIGURATIONS.values())
+def configuration(request: pytest.FixtureRequest) -> str:
+    """The name of a shipped configuration; each kind of networks and settings comes once."""
+    return str(request.param)
 
 
 @pytest.fixture

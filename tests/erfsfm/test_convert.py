@@ -171,8 +171,7 @@ def test_depth(tmp_path: Path, pose_file: Path, preset: str, deformable: frozens
         torch.testing.assert_close(model.depth_net(image), old(image), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("sources", [2, 4])
-@pytest.mark.parametrize("masks", [False, True])
+@pytest.mark.parametrize(("masks", "sources"), [(False, 4), (True, 2)])
 @pytest.mark.parametrize(
     ("preset", "deformable", "dilated"),
     [

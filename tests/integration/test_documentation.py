@@ -183,7 +183,8 @@ def parameter(block: Block) -> Any:
     return pytest.param(block, id=f"{block} {block.text[:50]}", marks=slow)
 
 
-RUNNABLE = [block for block in commands() if not reason_not_to_run(block.text)]
+# a command that several pages have runs once, where it stands first
+RUNNABLE = [*{block.text: block for block in reversed(commands()) if not reason_not_to_run(block.text)}.values()][::-1]
 OTHERS = [block for block in commands() if reason_not_to_run(block.text)]
 
 

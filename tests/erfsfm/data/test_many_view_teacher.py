@@ -9,6 +9,7 @@ import pytest
 
 from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig
+from erfsfm.data import many_view_teacher
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
@@ -23,7 +24,7 @@ SIZE = (64, 208)
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     root = tmp_path_factory.mktemp("world")
-    write_kitti_root(SimulatedStreet(SimulationOptions(frames=28, seed=704, route="straight")), root / "world")
+    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 28, 704, 312, 96)), root / "world")
     return discover(root / "world")[0]
 
 
@@ -70,7 +71,9 @@ def test_what_was_measured_is_kept_and_what_was_lost_is_measured_again(recording
     assert kept.stat().st_mtime_ns == written and len(lost.read_bytes()) == len(before)
 
 
-def test_of_two_programs_with_one_folder_one_measures(recording, teacher, tmp_path):
+def test_of_two_programs_with_one_folder_one_measures(recording, teacher, tmp_path, monkeypatch):
+    """In two processes, a label each, as they are measured in this one."""
+    monkeypatch.setattr(many_view_teacher, "_CHUNK", 1)
     told = {1: [], 2: []}
     both = {number: ManyViewTeacher(tmp_path, SIZE, stride=12) for number in told}
     both[1].drive(recording).keep_poses(teacher.drive(recording).T_world_camera)
@@ -83,8 +86,9 @@ def test_of_two_programs_with_one_folder_one_measures(recording, teacher, tmp_pa
         thread.start()
     for thread in threads:
         thread.join(60)
-    assert sorted(map(len, told.values())) == [0, 1], "measured once"
-    assert all(both[2].drive(recording).label_file(target).is_file() for target in (12, 24))
+    assert sorted(map(len, told.values())) == [0, 2], "measured once"
+    for target in (12, 24):
+        np.testing.assert_array_equal(both[2].drive(recording).label(target), teacher.drive(recording).label(target))
 
 
 def test_images_are_read_again_only_when_they_changed(recording, tmp_path, monkeypatch):

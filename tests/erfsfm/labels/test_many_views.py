@@ -1,8 +1,9 @@
 """Labels from many views against the simulated world, whose depth and poses are exact."""
 
+import functools
+
 import cv2
 import numpy as np
-import pytest
 
 from erfsfm.labels.many_views import direction_of_travel, label, sky_mask
 from slam.simulation.options import SimulationOptions
@@ -11,39 +12,50 @@ from slam.simulation.street import SimulatedStreet
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)
 
 
-@pytest.fixture(scope="module")
+@functools.cache
 def street() -> SimulatedStreet:
     return SimulatedStreet(SimulationOptions(frames=250, seed=703))
 
 
-def _label(street, index, guess=None):
-    T = np.linalg.inv(street.T_world_camera[[index + k for k in NEIGHBOURS]]) @ street.T_world_camera[index]
-    T[:, :3, 3] /= street.camera_height_m
-    grey = [street.render(index + k).image[..., 1].copy() for k in (0, *NEIGHBOURS)]
-    return label(grey[0], grey[1:], street.K, T, guess)
+@functools.cache
+def images(index):
+    return [street().render(index + k).image[..., 1].copy() for k in (0, *NEIGHBOURS)]
 
 
-def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth(street):
+def truth(index):
+    """Inverse depth in camera heights, 0 where it is unknown."""
+    depth = street().depth(index)
+    return np.where(depth > 0, street().camera_height_m / np.maximum(depth, 1e-6), 0)
+
+
+def measured(index, guess=None):
+    T = np.linalg.inv(street().T_world_camera[[index + k for k in NEIGHBOURS]]) @ street().T_world_camera[index]
+    T[:, :3, 3] /= street().camera_height_m
+    grey, *others = images(index)
+    return label(grey, others, street().K, T, guess)
+
+
+without_guess = functools.cache(measured)
+
+
+def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth():
     for index in (60, 150):
-        least, most = _label(street, index)
-        truth = street.camera_height_m / np.maximum(street.render(index).depth, 1e-6)
-        narrow = (least > 0) & (most < 1.5 * least) & (street.render(index).depth > 0)
+        (least, most), true = without_guess(index), truth(index)
+        narrow = (least > 0) & (most < 1.5 * least) & (true > 0)
         assert narrow.mean() > 0.4
         middle = np.sqrt(least[narrow] * most[narrow])
-        assert np.median(np.abs(middle / truth[narrow] - 1)) < 0.03
-        widened = (0.9 * least[narrow] < truth[narrow]) & (truth[narrow] < 1.1 * most[narrow])
+        assert np.median(np.abs(middle / true[narrow] - 1)) < 0.03
+        widened = (0.9 * least[narrow] < true[narrow]) & (true[narrow] < 1.1 * most[narrow])
         assert widened.mean() > 0.85
 
 
-def test_around_a_rough_guess_in_any_unit_more_is_known_and_it_is_as_right(street):
+def test_around_a_rough_guess_in_any_unit_more_is_known_and_it_is_as_right():
     for index in (60, 150):
-        depth = street.render(index).depth
-        true = np.where(depth > 0, street.camera_height_m / np.maximum(depth, 1e-6), 0)
+        true = truth(index)
         guess = 7 * cv2.GaussianBlur(true, (0, 0), 4).astype(np.float32) ** 0.9 + np.float32(0.05)
         known, errors = [], []
-        for given in (None, guess):
-            least, most = _label(street, index, given)
-            narrow = (least > 0) & (most < 1.5 * least) & (depth > 0)
+        for least, most in (without_guess(index), measured(index, guess)):
+            narrow = (least > 0) & (most < 1.5 * least) & (true > 0)
             known.append(narrow.mean())
             errors.append(np.mean(np.abs(np.sqrt(least[narrow] * most[narrow]) / true[narrow] - 1)))
         assert known[1] > known[0] + 0.05

@@ -90,8 +90,13 @@ def in_shell(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("arguments", ["config", "evaluate estimate.txt estimate.txt", "evaluate --help"])
-@pytest.mark.parametrize("end", ["| true", ">&-"])
+@pytest.mark.parametrize(
+    ("arguments", "end"),
+    [
+        *(("config", "| true"), ("config", ">&-")),
+        *(("evaluate --help", "| true"), ("evaluate estimate.txt estimate.txt", ">&-")),
+    ],
+)
 def test_a_closed_stdout_is_no_traceback(tmp_path: Path, arguments: str, end: str) -> None:
     (tmp_path / "estimate.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
     finished = in_shell(f"{arguments} {end}", tmp_path)

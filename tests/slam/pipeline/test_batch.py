@@ -288,7 +288,7 @@ def drive_street(
 ) -> Estimate:
     oracle = OraclePredictor(
         street.reference,
-        lambda k: np.where((depth := street.base.street.render(street.start + k).depth) > 0, depth, sky),
+        lambda k: np.where((depth := street.base.street.depth(street.start + k)) > 0, depth, sky),
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
@@ -303,10 +303,18 @@ def drive_street(
     return SlamPipeline(street, oracle, settings, progress, noise=noise).run()
 
 
-def test_two_runs_write_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def driven(street: Excerpt) -> tuple[Estimate, list[tuple[str, int, int]]]:
+    """A run, and what it told of its progress."""
+    calls: list[tuple[str, int, int]] = []
+    return drive_street(street, lambda *words: calls.append(words)), calls
+
+
+def test_two_runs_write_the_same_bytes(
+    street: Excerpt, driven: tuple[Estimate, list[tuple[str, int, int]]], tmp_path: Path
+) -> None:
     """Corner detection, RANSAC and the threads of GTSAM and Open3D must not change the result."""
-    for name in ("first", "second"):
-        result = drive_street(street)
+    for name, result in (("first", driven[0]), ("second", drive_street(street))):
         folder = tmp_path / name
         folder.mkdir()
         for stem in ("network", "odometry", "optimised"):
@@ -320,9 +328,8 @@ def test_two_runs_write_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
 
 
-def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
-    calls: list[tuple[str, int, int]] = []
-    result = drive_street(street, lambda *words: calls.append(words))
+def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple[str, int, int]]]) -> None:
+    result, calls = driven
     solved = [("loops and graph", k, 1) for k in range(2)]
     assert calls == [("frames", k, 25) for k in range(1, 26)] + solved + [("map", k, 13) for k in range(1, 14)]
     seen = result.drive
@@ -338,7 +345,7 @@ def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
 def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt) -> None:
     """In camera heights, which are no metres; depth of the sky is unknown."""
     result = drive_street(street, mode="none", sky=np.nan)
-    depths = [street.base.street.render(street.start + k).depth for k in range(0, 25, 6)]
+    depths = [street.base.street.depth(street.start + k) for k in range(0, 25, 6)]
     nearness = np.median([np.median(depth[depth > 0]) for depth in depths]) / street.camera_height_m
     assert result.map is not None
     assert result.map.voxel_size == pytest.approx(0.2 * nearness / 15.0, rel=0.15)

@@ -19,7 +19,7 @@ from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
-FRAMES = 60
+FRAMES = 50
 # calls over frames: a step measured by geometry, whose tracks all pass the first search at best
 MOST = {
     "depth": 0.6,
@@ -42,10 +42,10 @@ def counted(calls: Counter[str], name: str, of: Callable[..., Any]) -> Callable[
 
 
 def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
-    sequence, calls = SimulatedSequence(SimulationOptions("grid", FRAMES, 610, 416, 128)), Counter[str]()
+    sequence, calls = SimulatedSequence(SimulationOptions("grid", FRAMES, 610, 312, 96)), Counter[str]()
 
     def depth_of(index: int) -> np.ndarray:
-        depth = sequence.street.render(index).depth.astype(np.float64)
+        depth = sequence.street.depth(index)
         return np.where(depth > 0, depth, 200.0)
 
     oracle = OraclePredictor(sequence.reference, depth_of, OracleNoise(), 0.2)

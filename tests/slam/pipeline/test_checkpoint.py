@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -259,12 +260,16 @@ def test_folders_that_cannot_be_continued(go_on: Callable[..., RunFolder], begun
         go_on(continues=damaged)
 
 
+@functools.cache
+def street() -> SimulatedStreet:
+    return SimulatedStreet(SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64))
+
+
 def live(root: Path, **options: Any) -> Slam:
     sequence = open_sequence(root, "sim")
-    street = SimulatedStreet(SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64))
 
     def depth_of(index: int) -> np.ndarray:
-        depth = street.render(index).depth.astype(np.float64)
+        depth = street().depth(index)
         return np.where(depth > 0, depth, 200.0)
 
     assert sequence.reference is not None

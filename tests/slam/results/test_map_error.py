@@ -46,7 +46,7 @@ def true_map(embedded: SimulatedSequence) -> FloatArray:
     for k, T_world_camera in enumerate(embedded.reference if embedded.reference is not None else ()):
         depth = embedded.true_depth(k)
         seen = (camera.rays(camera.pixel_grid()) * depth[..., None])[(depth > 0) & (depth < 20)]
-        points.append(apply(T_world_camera, seen))
+        points.append(apply(T_world_camera, seen[::3]))
     return np.concatenate(points)
 
 

@@ -439,7 +439,9 @@ def test_a_port_that_does_not_exist_is_refused() -> None:
         pass
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP))]
+)
 def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path, number: signal.Signals) -> None:
     output, target, messages = tmp_path / "run", tmp_path / "images", []
     target.mkdir()

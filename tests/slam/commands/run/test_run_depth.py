@@ -28,6 +28,7 @@ from slam.simulation.street import SimulatedStreet
 
 CheckRun = Callable[[Path], dict[str, Any]]
 PLAIN = ["output.report=false", "mapping.enabled=false"]
+COARSE_MAP = ["mapping.enabled=true", "mapping.voxel_size_m=0.5", "depth.refine=none"]
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +95,7 @@ def test_our_exported_network_gives_the_run_of_our_weights(
 def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
     world: Path, arrays: Path, tmp_path: Path, check_run: CheckRun
 ) -> None:
-    pictures = run(world, tmp_path / "png", f"png:{exact(world)}", "mapping.enabled=true", "output.report=true")
+    pictures = run(world, tmp_path / "png", f"png:{exact(world)}", *COARSE_MAP, "output.report=true")
     metrics = check_run(pictures.path)
     assert metrics["scale"]["value"] == pytest.approx(1.0, abs=0.06)
     aligned = metrics["trajectories"]["optimised"]["align"]
@@ -123,7 +124,7 @@ def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_pat
     depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
     lens: dict[str, Any] = {"width": 416, "height": 128, "fx": 240, "fy": 240, "cx": 207, "cy": 60, "fps": 10}
     camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
-    chosen = ["mapping.enabled=true", "output.keep=keyframes"]
+    chosen = [*COARSE_MAP, "output.keep=keyframes"]
     finished = run(world, tmp_path / "run", f"png:{exact(world)}", *chosen, camera=camera, frames="0:7")
     pinhole = Places.read(finished.path / PLACES).intrinsics
     K, coefficients = np.array([[240, 0, 207], [0, 240, 60], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])

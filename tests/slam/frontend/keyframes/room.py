@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 
+from slam.config.sections import KeyframesConfig
 from slam.frames import Frame, Intrinsics
+from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 
 INTRINSICS = Intrinsics(width=320, height=240, fx=290.0, fy=290.0, cx=159.5, cy=119.5)
@@ -13,6 +17,7 @@ FAR, NEAR = 4.0, 1.8
 _PX_PER_M = 120.0
 
 
+@functools.cache
 def texture(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = rng.integers(0, 255, (100, 130), np.uint8)
@@ -54,3 +59,15 @@ def walk(frames: int, step_m: float = 0.03, turn: float = 0.004) -> FloatArray:
 
 def frame(index: int, T_world_camera: FloatArray, seed: int = 0, near: bool = True) -> Frame:
     return Frame(index, index / 30.0, image(T_world_camera, seed, near))
+
+
+def tracked(
+    config: KeyframesConfig, T_world_camera: FloatArray, seeds: list[int] | None = None
+) -> KeyframeOdometryState:
+    """The state after the frames of a camera; each shows the walls of its seed."""
+    odometry = KeyframeOdometry(config, INTRINSICS)
+    for k, T in enumerate(T_world_camera):
+        view = frame(k, T, 0 if seeds is None else seeds[k])
+        odometry.follow(view)
+        odometry.learn(view, depth_map(T))
+    return odometry.state()

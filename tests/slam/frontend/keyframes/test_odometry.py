@@ -21,15 +21,6 @@ _SPEC.loader.exec_module(room)
 CONFIG = KeyframesConfig(max_corners=200)
 
 
-def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometryState:
-    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
-    for k, T in enumerate(T_world_camera):
-        frame = room.frame(k, T, 0 if seeds is None else seeds[k])
-        odometry.follow(frame)
-        odometry.learn(frame, room.depth_map(T))
-    return odometry.state()
-
-
 def poses(state: KeyframeOdometryState) -> KeyframePoses:
     return keyframe_poses(state.segments, room.INTRINSICS)
 
@@ -43,7 +34,7 @@ def chained(found: KeyframePoses) -> dict[int, FloatArray]:
 
 def test_a_hand_held_camera_is_followed() -> None:
     truth = room.walk(70)
-    state = tracked(truth)
+    state = room.tracked(CONFIG, truth)
     found = poses(state)
     T = chained(found)
     assert sorted(T) == list(range(70))
@@ -81,14 +72,14 @@ def test_without_parallax_there_is_no_map_and_no_drift(motion: str) -> None:
     truth = room.walk(25, step_m=0.0, turn=turn)
     if motion == "standing":
         truth[:] = np.eye(4)
-    state = tracked(truth)
+    state = room.tracked(CONFIG, truth)
     assert not any(segment.started for segment in state.segments)
     assert poses(state).poses == []
 
 
 def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
     walked = room.walk(30)
-    state = tracked(np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
+    state = room.tracked(CONFIG, np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
     keyframes = state.segments[0].map.keyframes
     assert keyframes[-1].index <= 31
     T = chained(poses(state))
@@ -99,7 +90,7 @@ def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
 
 def test_another_scene_begins_another_map() -> None:
     walked = room.walk(80)
-    state = tracked(walked, [0] * 35 + [7] * 45)
+    state = room.tracked(CONFIG, walked, [0] * 35 + [7] * 45)
     found = poses(state)
     assert len(set(found.segments.values())) == 2
     assert max(frame for frame, number in found.segments.items() if number == 0) < 35
@@ -110,9 +101,9 @@ def test_another_scene_begins_another_map() -> None:
 
 def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     truth = room.walk(40)
-    whole = poses(tracked(truth))
+    whole = poses(room.tracked(CONFIG, truth))
     serialiser = Serialiser(KeyframeOdometryState, MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent)
-    serialiser.write(tmp_path / "state", tracked(truth[:25]))
+    serialiser.write(tmp_path / "state", room.tracked(CONFIG, truth[:25]))
     odometry = KeyframeOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
     for k in range(25, 40):
         frame = room.frame(k, truth[k])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,16 +23,16 @@ def outcome(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     def run(does: Callable[[list[str]], object], *words: str) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["program", *words])
         with pytest.raises(SystemExit) as stopped:
-            command_line.run(lambda args, prog_name: sys.exit(does(args)), "program")
+            command_line.run(lambda args, prog_name: sys.exit(does(args)), "program", logging.WARNING)
         return int(stopped.value.code or 0), capsys.readouterr().err
 
     return run
 
 
 def test_a_warning_that_repeats_is_counted() -> None:
-    program = "import logging, sys\nfrom erfsfm.common import command_line\ncommand_line.Terminal(logging.WARNING)\n"
+    program = "import logging\nfrom erfsfm.common import command_line\n"
     program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('cache').warning('entry %d', k)\n"
-    program += " raise OSError('the error')\ncommand_line.run(app, 'program')"
+    program += " raise OSError('the error')\ncommand_line.run(app, 'program', logging.WARNING)"
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False).stderr
     last = ["WARNING cache: entry 9", "WARNING cache: 101 more warnings of this kind", "program: the error"]
     assert said.splitlines()[9:] == last
@@ -93,7 +94,7 @@ def test_an_unexpected_error_is_shown_where_that_is_wanted(monkeypatch: pytest.M
     monkeypatch.setattr(sys, "argv", ["program"])
     monkeypatch.setenv(command_line.SHOW_TRACEBACK, "1")
     with pytest.raises(ZeroDivisionError):
-        command_line.run(lambda args, prog_name: raising(ZeroDivisionError())(args), "program")
+        command_line.run(lambda args, prog_name: raising(ZeroDivisionError())(args), "program", logging.WARNING)
 
 
 def test_an_error_of_a_data_loaders_process_is_its_last_line() -> None:

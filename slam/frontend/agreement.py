@@ -119,7 +119,8 @@ def of_images(
         needs_road: whether lengths are measured on the road.
     """
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
-    steps, on_road, mean = len(drive.steps.triangulated), len(drive.road_steps), float(support.mean())
+    steps = 0 if drive.maps else len(drive.steps.triangulated)  # lengths are then those of the maps
+    on_road, mean = len(drive.road_steps), float(support.mean())
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
     found = [("gaps", gaps, figure)]
@@ -134,7 +135,7 @@ def of_images(
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         found.append(("the view of the road", sigmas, figure))
     too_far = odometry.depth_error.most_too_far(_FAR_CORNERS)
-    if needs_road and not drive.maps and too_far is not None:
+    if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
     agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]

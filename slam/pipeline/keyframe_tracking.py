@@ -19,12 +19,14 @@ from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
+from slam.pipeline.pending import height_of
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
 _LAST = 4  # number of the last steps, repeated frames and unusable frames that are checked
 _DECISION_STEPS = 30  # triangulated steps after which auto decides
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
+_VEHICLE_SPEED = 1.5  # camera heights a second: a car at 9 km/h; a robot, a drone and a walker have less
 
 
 FrontEnd = Literal["steps", "both", "keyframes"]
@@ -157,12 +159,19 @@ class KeyframeTracking:
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:
-    """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
-    triangulated = (motion for motion in drive.motions if motion.is_triangulated)
-    first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, _DECISION_STEPS)]
+    """Whether the first triangulated steps all go the same way, as seen from the camera, at the speed of a vehicle.
+
+    None while they are few. Without a road nothing has the speed of a vehicle.
+    """
+    first = list(islice((motion for motion in drive.motions if motion.is_triangulated), _DECISION_STEPS))
     if len(first) < _DECISION_STEPS:
         return None
-    directions = np.array(first) / np.linalg.norm(first, axis=1, keepdims=True)
+    heights = [height for road in drive.roads if (height := height_of(road)) is not None]
+    speeds = [motion.length_unscaled / motion.seconds for motion in first]
+    if not heights or np.median(speeds) < _VEHICLE_SPEED * np.median(heights):
+        return False
+    steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])
+    directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     usual = np.median(directions, axis=0)
     cosine = directions @ usual / max(float(np.linalg.norm(usual)), 1e-9)
     return float(np.median(cosine)) > float(np.cos(np.deg2rad(_VEHICLE_SCATTER_DEG)))

@@ -9,6 +9,8 @@ from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.drive import Drive
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.checkpoint import SERIALISER
@@ -25,20 +27,28 @@ room = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(room)
 
 
-def steps(count: int, scatter: float) -> Drive:
+def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
+    """Steps of a camera height each."""
     rng = np.random.default_rng(0)
     motions = []
     for k in range(count):
         T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
-        motions.append(Motion(RelativePose(k, k + 1, T, np.ones(6), "essential"), np.ones(3)))
-    return Drive(motions=motions)
+        pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
+        motions.append(Motion(pose, np.ones(3), seconds=seconds))
+    return Drive(motions=motions, roads=[GroundPlane(1.0, np.array([0.0, 1.0, 0.0]), 1.0)] * count)
 
 
 @pytest.mark.parametrize(
-    ("count", "scatter", "front_end"), [(60, 0.02, "steps"), (60, 1.0, "keyframes"), (20, 0.02, "both")]
+    ("count", "scatter", "seconds", "front_end"),
+    [(60, 0.02, 0.1, "steps"), (60, 1.0, 0.1, "keyframes"), (60, 0.02, 1.0, "keyframes"), (20, 0.02, 0.1, "both")],
 )
-def test_a_vehicle_goes_the_same_way_for_a_while(count: int, scatter: float, front_end: FrontEnd) -> None:
-    assert choose(KeyframesConfig(), None, steps(count, scatter)) == front_end
+def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
+    count: int, scatter: float, seconds: float, front_end: FrontEnd
+) -> None:
+    drive = steps(count, scatter, seconds)
+    assert choose(KeyframesConfig(), None, drive) == front_end
+    drive.roads[:] = [MeasurementFailure("no road")] * count
+    assert choose(KeyframesConfig(), None, drive) != "steps"
 
 
 def test_a_known_camera_height_and_a_setting_choose() -> None:

@@ -21,7 +21,7 @@ class RunLog(logging.Handler):
 
     def begin(self, path: Path) -> None:
         """Write the buffered and all further records to a file."""
-        self._file = _QuietFile(path, encoding="utf-8")
+        self._file = _QuietFile(path, encoding="utf-8", errors="backslashreplace")
         self._file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         for record in self._kept:
             self._file.emit(record)

@@ -26,7 +26,7 @@ SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 _LOADING_BYTES = 384 * 2**20  # of NumPy, OpenCV and SciPy: OpenBLAS waits for ever for memory that it cannot have
 # what they would say of a file is said in our own line
 _OPENCV = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
-_MOST_TIMES = 10
+_MOST_TIMES = 3
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _NOT_UTF8 = "is not in UTF-8: rename it, or set the environment variable LC_ALL to C.UTF-8"
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
@@ -40,7 +40,7 @@ _MEMORY = re.compile(
 
 
 class Terminal(logging.StreamHandler[TextIO]):
-    """Standard error, to which a warning of one kind is said ten times, and then how often besides."""
+    """Standard error, to which a warning of one kind is said three times, and then how often besides."""
 
     def __init__(self, level: int) -> None:
         super().__init__(sys.stderr)
@@ -49,7 +49,7 @@ class Terminal(logging.StreamHandler[TextIO]):
         logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[self])
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Say a record, unless it was said ten times."""
+        """Say a record, unless it was said three times."""
         if record.levelno == logging.WARNING:
             self._times[f"{record.name}: {record.msg}"] += 1
         if self._times[f"{record.name}: {record.msg}"] <= _MOST_TIMES:

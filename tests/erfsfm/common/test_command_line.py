@@ -34,8 +34,8 @@ def test_a_warning_that_repeats_is_counted() -> None:
     program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('cache').warning('entry %d', k)\n"
     program += " raise OSError('the error')\ncommand_line.run(app, 'program', logging.WARNING)"
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False).stderr
-    last = ["WARNING cache: entry 9", "WARNING cache: 101 more warnings of this kind", "program: the error"]
-    assert said.splitlines()[9:] == last
+    last = ["WARNING cache: entry 2", "WARNING cache: 108 more warnings of this kind", "program: the error"]
+    assert said.splitlines()[2:] == last
 
 
 @pytest.mark.parametrize("words", [("--output", ""), ("--output=",)])

@@ -81,7 +81,7 @@ def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Es
     assert len(round_trip.optimised) == 250
     sources = [motion.relative_pose.source for motion in round_trip.drive.steps]
     assert sources.count(ESSENTIAL_SOURCE) > 200
-    assert ate(round_trip.network, round_trip) == pytest.approx(1.2, rel=0.2)
+    assert ate(round_trip.network, round_trip) == pytest.approx(0.94, rel=0.2)  # chained from snippets that touch
     assert ate(round_trip.odometry, round_trip) < 2 * 0.64
     assert ate(round_trip.optimised, round_trip) < 2 * 0.109
 

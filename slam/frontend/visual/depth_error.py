@@ -29,6 +29,7 @@ _KEPT = 0.98
 _PRIOR_CORNERS = 40.0
 _PRIOR_SIGMA = 0.2
 _LEAST_SIGMA = 0.1
+_USUAL_FAR_SIGMA = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +77,14 @@ class DepthError:
         return type(self)(corners)
 
     def most_too_far(self, least: float) -> float | None:
-        """The largest bias towards far; None without corners.
+        """The largest bias towards far, less where the depth there scatters more than usual; None without corners.
 
         Args:
             least: corners at a distance, over the most at any, that its bias counts.
         """
         corners = self.corners.sum(axis=1)
-        counted = self.bias[corners > least * corners.max()]
+        bias = self.bias / np.maximum(self._spread / _USUAL_FAR_SIGMA, 1.0)
+        counted = bias[corners > least * corners.max()]
         return float(counted.max()) if len(counted) else None
 
     def curve(self) -> list[tuple[float, float, float, float]]:

@@ -175,9 +175,10 @@ def _simulated(seeds: range, weights: str) -> Iterator[Outcome]:
             yield examine(f"world {seed}, {', '.join(weather) or 'as it is'}", whole(camera), camera, weights)
         if seed % 3 == 0:
             camera = SimulatedSequence(SimulationOptions("grid", FRAMES, seed))
+            drive = whole(camera)
             for oddity in list(ODDITIES)[1:]:
-                yield examine(f"world {seed}, {oddity}", ODDITIES[oddity](whole(camera)), camera, weights)
-            yield examine(f"world {seed}, {FOCAL}", whole(camera), camera, weights, focal_ratio=1.3)
+                yield examine(f"world {seed}, {oddity}", ODDITIES[oddity](drive), camera, weights)
+            yield examine(f"world {seed}, {FOCAL}", drive, camera, weights, focal_ratio=1.3)
 
 
 def summary(outcomes: Sequence[Outcome]) -> list[str]:

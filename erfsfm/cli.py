@@ -83,6 +83,31 @@ def train(
     print_rows(rows, as_json=False)
 
 
+@app.command("train-fusion")
+def train_fusion(
+    dataset: Annotated[list[Path], typer.Option(help="a simulated world with depth maps; repeat")],
+    validation: Annotated[list[Path], typer.Option(help="such a world, not trained on; repeat")],
+    output: Annotated[Path, typer.Option(help="receives fusion.onnx")] = Path("runs/fusion"),
+    weights: Weights = "default",
+    samples: Annotated[int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")] = 4000,
+    steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Train the network that fuses learned and measured depth; OUTPUT is what depth.fusion of a run takes.
+
+    Example: erfsfm train-fusion --dataset worlds/0 --validation worlds/1 --output runs/fusion
+    """
+    from erfsfm.training.fusion import train_fusion as run_training
+
+    command = shlex.join(["erfsfm", *sys.argv[1:]])
+    with progress_bar() as progress:
+        metrics = run_training(dataset, validation, output, weights, samples, steps, seed, command, progress)
+    print_rows([metrics], as_json)
+    if not as_json:
+        typer.echo(f"network in {output}: use it with --set depth.fusion={output}")
+
+
 @app.command()
 def pack(
     config: Annotated[str, typer.Option(help="of the training: a YAML file, or the name of a shipped configuration")],

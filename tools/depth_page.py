@@ -1,8 +1,9 @@
-"""Depth maps of a drive in one picture, and their errors over distance: image, networks, refined depth, truth.
+"""Depth maps of a drive in one picture, and their errors over distance: image, network, refined depth, truth.
 
-Runs the whole system with each of the weights; depth is in metres as the run gives it, no scale is fitted.
+Runs the whole system with each of the weights, and refines depth in each of the ways; depth is in metres as the run
+gives it, no scale is fitted. Means have the standard error of blocks of five keyframes.
 
-Example: python tools/depth_page.py docs/images/depth-0013.jpg --dataset KITTI_RAW/DRIVE --show 12 28 --weights OLD NEW
+Example: python tools/depth_page.py docs/images/depth-0013.jpg --dataset KITTI_RAW/DRIVE --show 12 28
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ EDGES_M = (1, 5, 10, 20, 40, 80)
 WIDTH_PX = 416
 NEAREST_M = 4.0  # of the colour scale
 RIM_PX = 6
+BLOCK = 5  # keyframes
 
-Errors = dict[str, list[NDArray[np.float64]]]  # by method: rows of truth and relative error
+Errors = dict[str, dict[int, NDArray[np.float64]]]  # by method and frame: rows of truth and relative error
 
 
 @dataclass(frozen=True)
@@ -54,26 +56,33 @@ def main(words: Sequence[str] | None = None) -> None:
     shown: dict[int, Shown] = {}
     drive = open_sequence(options.dataset, options.sequence, None, options.frames)
     for weights in options.weights:
-        run(drive, weights, options.set, partial(_note, drive, Path(weights).name, errors, shown))
+        run(drive, weights, options, partial(_note, drive, Path(weights).name, errors, shown))
     rows = [shown[min(shown, key=lambda index: abs(index - wanted))] for wanted in options.show]
     save_image(options.output, picture(rows))
     print(table(errors))
 
 
-def run(drive: FrameSequence, weights: str, settings: Sequence[str], compare: Callable[[KeyframeDepth], None]) -> None:
-    """The whole system on a drive; ``compare`` is called with the depth of every keyframe."""
+def run(
+    drive: FrameSequence, weights: str, options: argparse.Namespace, note: Callable[[str, KeyframeDepth], None]
+) -> None:
+    """The whole system on a drive; ``note`` is told each way to refine, and the depth of every keyframe."""
     networks = DepthPosePredictor.from_weights(weights, "cpu")
-    pipeline = SlamPipeline(
-        drive, NetworkPredictor(networks, drive.intrinsics), load_config(None, settings), noise=networks.noise
-    )
-    pipeline.fuse(pipeline.estimate(), compare)
+    predictor = NetworkPredictor(networks, drive.intrinsics)
+    estimate = None
+    for way in options.refine:
+        config = load_config(None, [*options.set, f"depth.refine={way}"])
+        pipeline = SlamPipeline(drive, predictor, config, noise=networks.noise)
+        estimate = estimate or pipeline.estimate()
+        pipeline.fuse(estimate, partial(note, way))
 
 
-def _note(drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Shown], keyframe: KeyframeDepth) -> None:
+def _note(
+    drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Shown], way: str, keyframe: KeyframeDepth
+) -> None:
     """Keep a keyframe's maps and errors."""
     depths = {name: keyframe.depth}
     if keyframe.network_depth is not None:
-        depths = {name: keyframe.network_depth, f"{name}, refined": keyframe.depth}
+        depths = {name: keyframe.network_depth, f"{name}, {way}": keyframe.depth}
     truth = true_depth(drive, keyframe.frame)
     before = shown.get(keyframe.frame)
     shown[keyframe.frame] = Shown(keyframe.image, (before.depths if before else {}) | depths, truth)
@@ -84,19 +93,28 @@ def _note(drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Show
         size = (truth.shape[1], truth.shape[0])
         guess = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)[known].astype(np.float64)
         relative = np.abs(guess - truth[known]) / truth[known]
-        errors.setdefault(method, []).append(np.stack([truth[known], relative]))
+        errors.setdefault(method, {})[keyframe.frame] = np.stack([truth[known], relative])
 
 
 def table(errors: Errors) -> str:
-    """Mean and median relative error of each method, whole and over distance, as Markdown."""
-    bins = list(pairwise(EDGES_M))
-    rows = []
-    for method, parts in errors.items():
-        truth, relative = np.concatenate(parts, axis=1)
-        chosen = [np.ones(len(truth), bool), *((truth >= a) & (truth < b) for a, b in bins)]
-        cells = [f"{relative[c].mean():.3f} / {np.median(relative[c]):.3f}" if c.any() else "-" for c in chosen]
-        rows.append([method, *cells])
-    return markdown(["depth", "all", *(f"{a}-{b} m" for a, b in bins)], rows)
+    """Mean, its standard error, and median of each method's relative error, whole and over distance, as Markdown."""
+    bins = [(EDGES_M[0], EDGES_M[-1]), *pairwise(EDGES_M)]
+    rows = [[method, *(_cell([*parts.values()], *edges) for edges in bins)] for method, parts in errors.items()]
+    return markdown(["depth", "all", *(f"{a}-{b} m" for a, b in bins[1:])], rows)
+
+
+def _cell(keyframes: Sequence[NDArray[np.float64]], least: float, most: float) -> str:
+    chosen = [relative[(truth >= least) & (truth < most)] for truth, relative in keyframes]
+    everything = np.concatenate(chosen)
+    if not len(everything):
+        return "-"
+    joined = [np.concatenate(chosen[n : n + BLOCK]) for n in range(0, len(chosen), BLOCK)]
+    blocks = [block for block in joined if len(block)]
+    sizes, means = np.array([len(block) for block in blocks]), np.array([block.mean() for block in blocks])
+    off = sizes * (means - everything.mean())
+    share = np.sqrt(len(blocks) / max(len(blocks) - 1, 1))
+    error = share * np.linalg.norm(off) / sizes.sum() if len(blocks) > 1 else np.nan
+    return f"{everything.mean():.3f} ± {error:.3f} / {np.median(everything):.3f}"
 
 
 def picture(rows: Sequence[Shown]) -> Image:
@@ -156,6 +174,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--sequence")
     add("--frames", metavar="A:B", help="half-open")
     add("--weights", nargs="+", default=["default"])
+    add("--refine", nargs="+", default=["multiview", "learned"], choices=["multiview", "learned"])
     add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="of the run")
     add("--show", nargs="+", type=int, default=[20, 60], help="frames; the nearest keyframes are shown")
     return parser

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.projection import Projection, halved
-from erfsfm.mvs.semi_global import smoothed
+from erfsfm.mvs.semi_global import Costs, smoothed
 from erfsfm.mvs.sweep import is_inside, lowest, sweep, warped
 
 STEPS = 2
@@ -48,6 +48,26 @@ class RefinedDepth:
     measured: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Measurement:
+    """What the neighbours of an image say about its depth.
+
+    ``change`` of log inverse depth ``(H, W)``, the ``information`` on it, and the ``fit``, the neighbours' mean weight;
+    ``costs`` of the plane sweep ``(C, h, w)`` at half size, and ``smoothed`` ones.
+    """
+
+    change: Array
+    information: Array
+    fit: Array
+    costs: Costs
+    smoothed: Costs
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Pixels ``(H, W)`` that the images decide."""
+        return (self.information > 1 / LEAST_PRIOR_SIGMA**2) & (self.fit >= LEAST_FIT)
+
+
 def refine(
     target: Appearance,
     depth: Array,
@@ -56,7 +76,7 @@ def refine(
     T_neighbour_target: NDArray[np.float64],
     road: Road | None = None,
 ) -> RefinedDepth:
-    """Refine the depth of an image.
+    """Refine the depth of an image, by rules.
 
     Args:
         target: the image, ``(H, W)``.
@@ -66,40 +86,52 @@ def refine(
         T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
         road: below which nothing static is seen: what seems to lie there moves with the camera and keeps the prior.
     """
-    height, width = depth.shape
-    inverse = (1 / depth).astype(np.float32)
-    change = _coarse_change(target, inverse, neighbours, K, T_neighbour_target)
-    change = _enlarged(np.asarray(cv2.medianBlur(change, 5), np.float32), target)
-    views = [(other, Projection(K, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
-    for _ in range(STEPS):
-        step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
-        change += step
-    unexplained = fit < LEAST_FIT
-    measured = (information > 1 / LEAST_PRIOR_SIGMA**2) & ~unexplained
-    change[unexplained] = 0
+    measurement = measure(target, depth, neighbours, K, T_neighbour_target)
+    change, measured = measurement.change, measurement.measured
+    change[measurement.fit < LEAST_FIT] = 0
     if road is not None:
-        moving = _under_road(1 / (inverse * np.exp(change)), K, road) & ~_under_road(depth, K, road)
+        moving = _under_road(depth * np.exp(-change), K, road) & ~_under_road(depth, K, road)
         moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         change[moving], measured[moving] = 0, False
     prior_sigma = max(LEAST_PRIOR_SIGMA, 1.48 * float(np.median(np.abs(change[measured])))) if measured.any() else 1.0
-    known = np.where(measured, information, 0) + 1 / prior_sigma**2
+    known = np.where(measured, measurement.information, 0) + 1 / prior_sigma**2
     sigma = np.sqrt(1 / known + SIGMA_FLOOR**2)
     return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma.astype(np.float32), measured)
 
 
-def _coarse_change(
+def measure(
+    target: Appearance,
+    depth: Array,
+    neighbours: Sequence[Appearance],
+    K: NDArray[np.floating],
+    T_neighbour_target: NDArray[np.float64],
+) -> Measurement:
+    """Compare an image with its neighbours around its learned depth; arguments as of `refine`."""
+    height, width = depth.shape
+    inverse = (1 / depth).astype(np.float32)
+    costs = _costs(target, inverse, neighbours, K, T_neighbour_target)
+    smooth = smoothed(costs, target.coarse_grey)
+    change = _enlarged(np.asarray(cv2.medianBlur(lowest(smooth), 5), np.float32), target)
+    views = [(other, Projection(K, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
+    for _ in range(STEPS):
+        step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
+        change += step
+    return Measurement(change, information, fit, costs, smooth)
+
+
+def _costs(
     target: Appearance,
     inverse: Array,
     neighbours: Sequence[Appearance],
     K: NDArray[np.floating],
     T_neighbour_target: NDArray[np.float64],
-) -> Array:
-    """Change of log inverse depth ``(h, w)`` at half size."""
+) -> Costs:
+    """Of each change of log inverse depth, ``(C, h, w)`` at half size."""
     height, width = target.coarse.shape
     small = np.asarray(cv2.resize(inverse, (width, height), interpolation=cv2.INTER_AREA), np.float32)
     K_half = halved(K)
     views = [(other.coarse, Projection(K_half, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
-    return lowest(smoothed(sweep(target.coarse, views, small), target.coarse_grey))
+    return sweep(target.coarse, views, small)
 
 
 def _enlarged(change: Array, target: Appearance) -> Array:

@@ -20,6 +20,7 @@ def exported(
     example: Sequence[Tensor | list[Tensor]],
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
+    free: Sequence[int] = (),
 ) -> bytes:
     """An ONNX file of a network, for inputs of the example's shapes.
 
@@ -28,6 +29,7 @@ def exported(
         example: its inputs.
         inputs: their names, lists counted one by one.
         outputs: names of its outputs.
+        free: axes of the named inputs whose size may differ from the example's.
     """
     # Sizes become constants, as intended. The filters are those of the whole process and stay: graphs are made in a
     # thread, and `warnings.catch_warnings` is not safe there.
@@ -42,6 +44,7 @@ def exported(
             file,  # type: ignore[arg-type]  # in memory: no disk that may be full
             input_names=inputs,
             output_names=outputs,
+            dynamic_axes={name: {axis: f"axis{axis}" for axis in free} for name in inputs or ()} if free else None,
             opset_version=OPSET,
             dynamo=False,  # the newer exporter needs onnxscript, and writes the same graph
         )

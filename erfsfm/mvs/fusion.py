@@ -1,0 +1,78 @@
+"""Depth refined by a trained network that reads the evidence of the neighbouring images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from onnxruntime import InferenceSession
+
+from erfsfm.common.errors import CheckpointError
+from erfsfm.common.files import read_bytes
+from erfsfm.common.onnx_session import open_session
+from erfsfm.mvs.appearance import Appearance, Array
+from erfsfm.mvs.evidence import CHANNELS, evidence
+from erfsfm.mvs.refine import SIGMA_FLOOR, RefinedDepth, Road, measure
+
+FILE = "fusion.onnx"
+SHIPPED = Path(__file__).parents[1] / "weights" / "fusion"
+LEVELS = 3  # halvings inside the network
+_MOST_BYTES = 2**26
+_MOST_SIGMA = 2.0
+_THREADS = 1
+
+
+class DepthFusion:
+    """A network of ``erfsfm train-fusion``.
+
+    Args:
+        name: "default", or its output folder, which holds ``fusion.onnx``.
+
+    Raises:
+        CheckpointError: there is none, or it is not such a network.
+    """
+
+    def __init__(self, name: str) -> None:
+        path = (SHIPPED if name == "default" else Path(name)) / FILE
+        try:
+            self._session: InferenceSession = open_session(read_bytes(path, _MOST_BYTES), _THREADS)
+        except OSError as error:
+            raise CheckpointError(f"{path} cannot be read; give an output folder of erfsfm train-fusion") from error
+        except Exception as error:  # ONNX Runtime raises classes of its own
+            raise CheckpointError(f"{path} is damaged, or no ONNX file: train it again") from error
+        inputs = self._session.get_inputs()
+        if [i.name for i in inputs] != ["evidence"] or inputs[0].shape[1] != CHANNELS:
+            raise CheckpointError(
+                f"{path} is not a network of erfsfm train-fusion, or of another version: train it again"
+            )
+
+    def refine(
+        self,
+        target: Appearance,
+        depth: Array,
+        neighbours: Sequence[Appearance],
+        K: NDArray[np.floating],
+        T_neighbour_target: NDArray[np.float64],
+        road: Road | None = None,
+    ) -> RefinedDepth:
+        """As `erfsfm.mvs.refine.refine`; the network finds by itself what moves, and needs no road."""
+        measurement = measure(target, depth, neighbours, K, T_neighbour_target)
+        channels = evidence(target, depth, measurement, K)
+        h, w = channels.shape[1:]
+        step = 2**LEVELS
+        padded = np.pad(channels, ((0, 0), (0, -h % step), (0, -w % step)), mode="edge")
+        change, log_sigma = (
+            _at_size(values[0, : 2 * h, : 2 * w], depth.shape)
+            for values in self._session.run(["change", "log_sigma"], {"evidence": padded[None]})
+        )
+        sigma = np.hypot(np.minimum(np.exp(log_sigma), np.float32(_MOST_SIGMA)), np.float32(SIGMA_FLOOR))
+        return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma, measurement.measured)
+
+
+def _at_size(values: Array, shape: tuple[int, ...]) -> Array:
+    """With the last row and column again where the size is odd."""
+    below, right = shape[0] - values.shape[0], shape[1] - values.shape[1]
+    return np.asarray(cv2.copyMakeBorder(values, 0, below, 0, right, cv2.BORDER_REPLICATE))

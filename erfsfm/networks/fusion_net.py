@@ -1,0 +1,58 @@
+"""A small U-Net that decides between learned and measured depth, pixel by pixel, and says how sure it is."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from erfsfm.mvs.evidence import CHANGE, CHANNELS
+from erfsfm.mvs.fusion import LEVELS
+
+WIDTHS = (16, 32, 64, 96)
+_TRUST = 3.0  # of a fresh network in the measurement: its logit
+_UNSURE = -3.0  # logarithm of its sigma
+_LARGEST_CHANGE = 2.0
+
+
+class FusionNet(nn.Module):
+    """Evidence ``(B, CHANNELS, h, w)`` to the change of log inverse depth and the log of its sigma, ``(B, 2h, 2w)``.
+
+    The change is a mean of the measured one and one of its own, so a trusted measurement keeps its precision. Height
+    and width are multiples of ``2 ** LEVELS``.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        assert len(WIDTHS) == LEVELS + 1
+        self.down = nn.ModuleList([_block(CHANNELS, WIDTHS[0]), *(_block(a, b) for a, b in pairwise(WIDTHS))])
+        self.up = nn.ModuleList([_block(a + b, b) for a, b in pairwise(WIDTHS[::-1])])
+        self.head = nn.Conv2d(WIDTHS[0], 12, 3, padding=1)
+        nn.init.zeros_(self.head.weight)
+        assert self.head.bias is not None
+        with torch.no_grad():
+            self.head.bias.copy_(torch.tensor([_TRUST, 0.0, _UNSURE]).repeat_interleave(4))
+
+    def forward(self, evidence: Tensor) -> tuple[Tensor, Tensor]:
+        """See the class."""
+        kept = [self.down[0](evidence)]
+        for block in list(self.down)[1:]:
+            kept.append(block(functional.max_pool2d(kept[-1], 2)))
+        decided = kept.pop()
+        for block in self.up:
+            larger = functional.interpolate(decided, scale_factor=2, mode="bilinear", align_corners=False)
+            decided = block(torch.cat([larger, kept.pop()], 1))
+        trust, own, log_sigma = self.head(decided).float().split(4, 1)
+        trust = torch.sigmoid(trust)
+        measured = evidence[:, 4 * CHANGE : 4 * CHANGE + 4]
+        change = trust * measured + (1 - trust) * _LARGEST_CHANGE * torch.tanh(own)
+        return functional.pixel_shuffle(change, 2)[:, 0], functional.pixel_shuffle(log_sigma, 2)[:, 0]
+
+
+def _block(inputs: int, outputs: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for channels in (inputs, outputs):
+        layers += [nn.Conv2d(channels, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()]
+    return nn.Sequential(*layers)

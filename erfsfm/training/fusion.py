@@ -1,0 +1,192 @@
+"""Training of the network that fuses learned depth with the measurements of neighbouring images."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from erfsfm.common.errors import TrainingError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.progress import Progress
+from erfsfm.common.threads import stay_single_threaded
+from erfsfm.data.discovery import discover
+from erfsfm.inference import DepthPosePredictor
+from erfsfm.mvs.evidence import CHANGE, CHANNELS
+from erfsfm.mvs.fusion import FILE, LEVELS
+from erfsfm.networks.fusion_net import FusionNet
+from erfsfm.networks.onnx_export import exported
+from erfsfm.training.fusion_samples import FusionSamples, Sample
+
+RECORD = "fusion.json"
+_BATCH = 8
+_LEARNING_RATE, _LEAST_RATE = 2e-3, 0.01
+_WARM_UP = 100
+_WEIGHT_DECAY = 1e-3
+_HUBER = 0.02  # of log depth
+_RELATIVE, _LIKELIHOOD, _EDGES, _SKY = 0.5, 0.1, 0.3, 0.2  # weights of losses beside the error of log depth
+_EDGE_STEPS = (1, 2, 4)  # pixels
+_LARGEST_ERROR = 1.5  # of log depth, for the relative error
+_CHUNK = 100  # samples of one task and one seed
+_VALIDATION_SEED = 10**6
+_COVERAGE, _SIGMAS = 0.9, 1.645  # the sigma is scaled so that this share of the errors is within as many of it
+
+
+def train_fusion(
+    datasets: Sequence[Path],
+    validation: Sequence[Path],
+    output: Path,
+    weights: str,
+    samples: int,
+    steps: int,
+    seed: int,
+    command: str,
+    progress: Progress,
+) -> dict[str, float]:
+    """Train on simulated worlds, write ``fusion.onnx`` and a record; returns the errors on the validation's worlds.
+
+    Args:
+        datasets: roots with depth maps and poses.
+        validation: such roots, not trained on, which also fit the sigma.
+        output: receives the files.
+        weights: of the network that guesses depth.
+        samples: to draw; a thousand takes 0.7 GB of memory.
+        steps: of optimisation, with batches of eight.
+        seed: of everything drawn.
+        command: for the record.
+        progress: is told.
+
+    Raises:
+        TrainingError: data without depth or poses.
+    """
+    torch.manual_seed(seed)
+    data = _drawn(datasets, weights, samples, seed, progress)
+    held_out = _drawn(validation, weights, max(samples // 20, _CHUNK), _VALIDATION_SEED, progress)
+    net = FusionNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    _optimise(net, data, steps, seed, progress)
+    net.eval()
+    metrics = _fit_sigma(net, held_out)
+    graph = exported(
+        net, [torch.zeros(1, CHANNELS, 2**LEVELS, 2**LEVELS)], ["evidence"], ["change", "log_sigma"], (2, 3)
+    )
+    output.mkdir(parents=True, exist_ok=True)
+    write_atomically(output / FILE, lambda path: path.write_bytes(graph))
+    record = {"command": command, "weights": weights, "samples": samples, "steps": steps, "seed": seed, **metrics}
+    write_atomically(output / RECORD, lambda path: path.write_text(json.dumps(record, indent=2) + "\n"))
+    return metrics
+
+
+def _drawn(roots: Sequence[Path], weights: str, count: int, seed: int, progress: Progress) -> list[Sample]:
+    """Samples of worlds, by as many processes as there are cores; the same for any number of them."""
+    chunks = [seed * 10**4 + n for n in range(math.ceil(count / _CHUNK))]
+    drawn: list[Sample] = []
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:
+        for part in pool.map(partial(_chunk, tuple(roots), weights), chunks):
+            drawn += part
+            progress("evidence", min(len(drawn), count), count)
+    return drawn[:count]
+
+
+def _chunk(roots: Sequence[Path], weights: str, seed: int) -> list[Sample]:
+    recordings = [recording for root in roots for recording in discover(root)]
+    source = FusionSamples(recordings, DepthPosePredictor.from_weights(weights, runtime="onnx"), seed)
+    return [source.draw() for _ in range(_CHUNK)]
+
+
+def _optimise(net: FusionNet, data: Sequence[Sample], steps: int, seed: int, progress: Progress) -> None:
+    rng = np.random.default_rng(seed)
+    optimiser = torch.optim.AdamW(net.parameters(), _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+
+    def rate(step: int) -> float:
+        return min(1, (step + 1) / _WARM_UP) * max(_LEAST_RATE, (1 + math.cos(math.pi * step / steps)) / 2)
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)
+    order: list[int] = []
+    for step in range(steps):
+        if len(order) < _BATCH:
+            order = rng.permutation(len(data)).tolist()
+        evidence, wanted, is_known = _batch([data[order.pop()] for _ in range(min(_BATCH, len(order)))])
+        if rng.random() < 0.5:
+            evidence, wanted, is_known = _mirrored(evidence), wanted.flip(-1), is_known.flip(-1)
+        with torch.autocast("cpu", torch.bfloat16):
+            change, log_sigma = net(evidence)
+        loss = fusion_loss(change, log_sigma, wanted, is_known)
+        if not torch.isfinite(loss):
+            raise TrainingError(f"the loss is not finite at step {step}: begin again with another --seed")
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        progress(f"training, loss {loss.item():.3f}", step + 1, steps)
+
+
+def fusion_loss(change: Tensor, log_sigma: Tensor, wanted: Tensor, is_known: Tensor) -> Tensor:
+    """Huber's error of log depth, its relative error, edges, the likelihood of the sigma, and sky that is too near.
+
+    Args:
+        change: of log inverse depth ``(B, H, W)``.
+        log_sigma: of it ``(B, H, W)``.
+        wanted: the change to the true depth, in the sky to the least one ``(B, H, W)``.
+        is_known: where the true depth is known ``(B, H, W)``.
+    """
+    known = is_known.float()
+    count = known.sum().clamp(min=1)
+    error = (wanted - change) * known  # of log depth
+    huber = functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="sum", beta=_HUBER)
+    relative = (torch.exp(error.clamp(-2 * _LARGEST_ERROR, _LARGEST_ERROR)) - 1).abs().sum()
+    log_sigma = log_sigma.clamp(-5, _LARGEST_ERROR)
+    likelihood = ((error.detach().abs() * torch.exp(-log_sigma) + log_sigma) * known).sum()
+    edges = error.new_zeros(())
+    for step in _EDGE_STEPS:
+        along = (error[:, :, step:] - error[:, :, :-step]).abs() * known[:, :, step:] * known[:, :, :-step]
+        across = (error[:, step:] - error[:, :-step]).abs() * known[:, step:] * known[:, :-step]
+        edges = edges + along.mean() + across.mean()
+    sky = ((change - wanted).clamp(min=0) * (1 - known)).mean()
+    return (huber + _RELATIVE * relative + _LIKELIHOOD * likelihood) / count + _EDGES * edges + _SKY * sky
+
+
+def _batch(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor]:
+    evidence, wanted, is_known = (torch.from_numpy(np.stack(part)) for part in zip(*samples, strict=True))
+    return evidence.float().contiguous(memory_format=torch.channels_last), wanted.float(), is_known
+
+
+def _mirrored(evidence: Tensor) -> Tensor:
+    """Left and right exchanged, also in the blocks of four channels."""
+    count, channels, h, w = evidence.shape
+    blocks = 4 * ((channels - 7) // 4)
+    full = evidence[:, :blocks].reshape(count, -1, 2, 2, h, w).flip(3).reshape(count, blocks, h, w)
+    return torch.cat([full, evidence[:, blocks:]], 1).flip(-1).contiguous(memory_format=torch.channels_last)
+
+
+@torch.inference_mode()
+def _fit_sigma(net: FusionNet, data: Sequence[Sample]) -> dict[str, float]:
+    """Scale the sigma to the errors; returns mean and median relative errors of guess, measurement and network."""
+    errors: dict[str, list[Tensor]] = {"guess": [], "measured": [], "fused": []}
+    ratios = []
+    for first in range(0, len(data), _BATCH):
+        evidence, wanted, is_known = _batch(data[first : first + _BATCH])
+        change, log_sigma = net(evidence)
+        measured = functional.pixel_shuffle(evidence[:, 4 * CHANGE : 4 * CHANGE + 4], 2)[:, 0]
+        for name, found in (("guess", torch.zeros_like(change)), ("measured", measured), ("fused", change)):
+            errors[name].append((torch.exp((wanted - found)[is_known]) - 1).abs())
+        ratios.append(((wanted - change).abs() * torch.exp(-log_sigma))[is_known])
+    every = torch.cat(ratios)[::7]
+    factor = torch.quantile(every[: 10**7], _COVERAGE) / _SIGMAS
+    assert net.head.bias is not None
+    net.head.bias[8:] += torch.log(factor)
+    all_errors = {name: torch.cat(parts) for name, parts in errors.items()}
+    return {f"{name}_mean": float(e.mean()) for name, e in all_errors.items()} | {
+        f"{name}_median": float(e.median()) for name, e in all_errors.items()
+    }

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from erfsfm.cli import main
+from erfsfm.common.errors import CheckpointError
+from erfsfm.mvs.evidence import CHANGE, CHANNELS
+from erfsfm.mvs.fusion import FILE, DepthFusion
+from erfsfm.networks.fusion_net import FusionNet
+from erfsfm.training.fusion import fusion_loss
+
+Cli = Callable[..., tuple[int, str, str]]
+
+
+def test_a_fresh_network_trusts_the_measurement_at_every_pixel() -> None:
+    evidence = torch.zeros(1, CHANNELS, 16, 24)
+    block = evidence[:, 4 * CHANGE : 4 * CHANGE + 4]
+    block[:] = torch.rand(block.shape)
+    change, log_sigma = FusionNet().eval()(evidence)
+    measured = torch.nn.functional.pixel_shuffle(block, 2)[:, 0]
+    torch.testing.assert_close(change / measured, torch.full_like(measured, torch.sigmoid(torch.tensor(3.0)).item()))
+    assert log_sigma.shape == change.shape == (1, 32, 48)
+
+
+def test_the_loss_is_least_at_the_truth_and_where_the_sigma_is_the_error() -> None:
+    wanted = torch.linspace(-0.5, 0.5, 96).reshape(1, 8, 12)
+    known = torch.ones_like(wanted, dtype=torch.bool)
+    sigma = torch.full_like(wanted, -2.0)
+    right = fusion_loss(wanted, sigma, wanted, known)
+    assert right < fusion_loss(wanted + 0.1, sigma, wanted, known)
+    off = [fusion_loss(wanted + 0.2, torch.full_like(wanted, log), wanted, known) for log in np.log([0.1, 0.2, 0.4])]
+    assert off[1] < min(off[0], off[2])
+    sky = torch.zeros_like(known)
+    farther = fusion_loss(wanted - 1, sigma, wanted, sky)
+    assert farther == fusion_loss(wanted - 2, sigma, wanted, sky) < fusion_loss(wanted + 1, sigma, wanted, sky)
+
+
+@pytest.mark.slow
+def test_a_network_is_trained_on_worlds_and_refines_a_run(tmp_path: Path, command_line: Cli) -> None:
+    for seed in (3, 4):
+        simulate = ["simulate", str(tmp_path / f"{seed}"), "--seed", str(seed), "--frames", "20", "--route", "grid"]
+        subprocess.run([sys.executable, "-m", "slam", *simulate, "--depth"], check=True, capture_output=True)
+    roots = ["--dataset", tmp_path / "3", "--validation", tmp_path / "4"]
+    words = ["train-fusion", *roots, "--output", tmp_path / "net", "--weights", "sim", "--samples", "80", "--steps", "20"]
+    code, out, _ = command_line(main, "erfsfm", *words, "--json")
+    (metrics,) = json.loads(out)
+    assert code == 0 and metrics["fused_mean"] < metrics["guess_mean"]
+    run = ["run", "--dataset", tmp_path / "4", "--weights", "sim", "--set", f"depth.fusion={tmp_path / 'net'}"]
+    done = subprocess.run([sys.executable, "-m", "slam", *run, "--output", tmp_path / "run"], capture_output=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["depth"]["refined"]["median_rel"] < 0.5
+
+
+def test_what_is_no_fusion_network_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="erfsfm train-fusion"):
+        DepthFusion(str(tmp_path))
+    (tmp_path / FILE).write_bytes(b"no graph")
+    with pytest.raises(CheckpointError, match="damaged"):
+        DepthFusion(str(tmp_path))
+
+
+def test_worlds_without_depth_are_refused(tmp_path: Path, command_line: Cli) -> None:
+    world = tmp_path / "world"
+    simulate = [sys.executable, "-m", "slam", "simulate", str(world), "--frames", "6", "--route", "straight"]
+    subprocess.run(simulate, check=True, capture_output=True)
+    roots = ["--dataset", world, "--validation", world]
+    code, _, err = command_line(main, "erfsfm", "train-fusion", *roots, "--output", tmp_path / "net", "--samples", "8", "--steps", "1")
+    assert code == 1 and "--depth" in err and len(err.strip().splitlines()) == 1

@@ -13,8 +13,9 @@ from erfsfm.mvs.refine import Measurement
 from erfsfm.mvs.semi_global import UNIT, Costs
 from erfsfm.mvs.sweep import CHANGES, lowest
 
-FULL_SIZE = 6  # maps at full size, four channels each
-CHANNELS = 4 * FULL_SIZE + 7
+FULL_SIZE = 6  # maps at full size, four channels each, before those at half size
+HALF_SIZE = 6
+CHANNELS = 4 * FULL_SIZE + HALF_SIZE
 CHANGE = 2  # which of the maps at full size is the measured change
 _GUESS = int(np.abs(CHANGES).argmin())
 _APART = 2  # samples between the least cost and the second minimum
@@ -43,28 +44,18 @@ def evidence(target: Appearance, depth: Array, measurement: Measurement, K: NDAr
         np.log(np.maximum(measurement.information, _LEAST_INFORMATION)) / 4,
         y * np.exp(-nearness - measurement.change),  # height under the camera over the median depth
     )
-    half = _of_costs(measurement.costs, measurement.smoothed)
+    half = _of_costs(measurement.costs, measurement.coarse)
     return np.concatenate([np.clip([_quartered(part, h, w) for part in full], -_MOST, _MOST).reshape(-1, h, w), half])
 
 
-def _of_costs(costs: Costs, smoothed: Costs) -> Array:
-    """Of the sweep: its best change and cost, the cost of the guess, the second minimum; of its smoothed costs."""
+def _of_costs(costs: Costs, coarse: Array) -> Array:
+    """Of the sweep: its best change and cost, the cost of the guess, the second minimum; the change when smoothed."""
     best = costs.argmin(axis=0).astype(np.int8)
     apart = np.abs(np.arange(len(costs), dtype=np.int8)[:, None, None] - best) > _APART
-    others = np.where(apart, costs, np.iinfo(np.int16).max)
+    others = np.where(apart, costs, np.int16(np.iinfo(np.int16).max))
     second = others.argmin(axis=0)
-    of_guess = smoothed[_GUESS] - smoothed.min(axis=0).astype(np.float32)
-    return np.stack(
-        [
-            lowest(costs),
-            costs.min(axis=0) / np.float32(UNIT),
-            costs[_GUESS] / np.float32(UNIT),
-            others.min(axis=0) / np.float32(UNIT),
-            CHANGES[second],
-            lowest(smoothed),
-            np.minimum(of_guess / np.float32(UNIT), np.float32(_MOST)),
-        ]
-    ).astype(np.float32)
+    least = np.stack([costs.min(axis=0), costs[_GUESS], np.take_along_axis(others, second[None], axis=0)[0]])
+    return np.concatenate([[lowest(costs)], least / np.float32(UNIT), [CHANGES[second], coarse]]).astype(np.float32)
 
 
 def _quartered(part: Array, h: int, w: int) -> Array:

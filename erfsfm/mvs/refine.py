@@ -53,14 +53,14 @@ class Measurement:
     """What the neighbours of an image say about its depth.
 
     ``change`` of log inverse depth ``(H, W)``, the ``information`` on it, and the ``fit``, the neighbours' mean weight;
-    ``costs`` of the plane sweep ``(C, h, w)`` at half size, and ``smoothed`` ones.
+    ``costs`` of the plane sweep ``(C, h, w)`` at half size, and the ``coarse`` change ``(h, w)`` by smoothed ones.
     """
 
     change: Array
     information: Array
     fit: Array
     costs: Costs
-    smoothed: Costs
+    coarse: Array
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -110,13 +110,13 @@ def measure(
     height, width = depth.shape
     inverse = (1 / depth).astype(np.float32)
     costs = _costs(target, inverse, neighbours, K, T_neighbour_target)
-    smooth = smoothed(costs, target.coarse_grey)
-    change = _enlarged(np.asarray(cv2.medianBlur(lowest(smooth), 5), np.float32), target)
+    coarse = lowest(smoothed(costs, target.coarse_grey))
+    change = _enlarged(np.asarray(cv2.medianBlur(coarse, 5), np.float32), target)
     views = [(other, Projection(K, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
     for _ in range(STEPS):
         step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step
-    return Measurement(change, information, fit, costs, smooth)
+    return Measurement(change, information, fit, costs, coarse)
 
 
 def _costs(

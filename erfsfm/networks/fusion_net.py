@@ -27,8 +27,9 @@ class FusionNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         assert len(WIDTHS) == LEVELS + 1
-        self.down = nn.ModuleList([_block(CHANNELS, WIDTHS[0]), *(_block(a, b) for a, b in pairwise(WIDTHS))])
-        self.up = nn.ModuleList([_block(a + b, b) for a, b in pairwise(WIDTHS[::-1])])
+        self.down = nn.ModuleList(nn.Sequential(*_layer(a, b), *_layer(b, b)) for a, b in pairwise((CHANNELS, *WIDTHS)))
+        self.narrow = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in pairwise(WIDTHS[::-1]))
+        self.up = nn.ModuleList(nn.Sequential(*_layer(width, width)) for width in WIDTHS[-2::-1])
         self.head = nn.Conv2d(WIDTHS[0], 12, 3, padding=1)
         nn.init.zeros_(self.head.weight)
         assert self.head.bias is not None
@@ -41,9 +42,9 @@ class FusionNet(nn.Module):
         for block in list(self.down)[1:]:
             kept.append(block(functional.max_pool2d(kept[-1], 2)))
         decided = kept.pop()
-        for block in self.up:
-            larger = functional.interpolate(decided, scale_factor=2, mode="bilinear", align_corners=False)
-            decided = block(torch.cat([larger, kept.pop()], 1))
+        for narrow, block in zip(self.narrow, self.up, strict=True):
+            larger = functional.interpolate(narrow(decided), scale_factor=2, mode="bilinear", align_corners=False)
+            decided = block(larger + kept.pop())
         trust, own, log_sigma = self.head(decided).float().split(4, 1)
         trust = torch.sigmoid(trust)
         measured = evidence[:, 4 * CHANGE : 4 * CHANGE + 4]
@@ -51,8 +52,5 @@ class FusionNet(nn.Module):
         return functional.pixel_shuffle(change, 2)[:, 0], functional.pixel_shuffle(log_sigma, 2)[:, 0]
 
 
-def _block(inputs: int, outputs: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for channels in (inputs, outputs):
-        layers += [nn.Conv2d(channels, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()]
-    return nn.Sequential(*layers)
+def _layer(inputs: int, outputs: int) -> list[nn.Module]:
+    return [nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()]

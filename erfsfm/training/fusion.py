@@ -22,7 +22,7 @@ from erfsfm.common.progress import Progress
 from erfsfm.common.threads import stay_single_threaded
 from erfsfm.data.discovery import discover
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.mvs.evidence import CHANGE, CHANNELS
+from erfsfm.mvs.evidence import CHANGE, CHANNELS, FULL_SIZE
 from erfsfm.mvs.fusion import FILE, LEVELS
 from erfsfm.networks.fusion_net import FusionNet
 from erfsfm.networks.onnx_export import exported
@@ -164,8 +164,8 @@ def _batch(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor]:
 
 def _mirrored(evidence: Tensor) -> Tensor:
     """Left and right exchanged, also in the blocks of four channels."""
-    count, channels, h, w = evidence.shape
-    blocks = 4 * ((channels - 7) // 4)
+    count, _, h, w = evidence.shape
+    blocks = 4 * FULL_SIZE
     full = evidence[:, :blocks].reshape(count, -1, 2, 2, h, w).flip(3).reshape(count, blocks, h, w)
     return torch.cat([full, evidence[:, blocks:]], 1).flip(-1).contiguous(memory_format=torch.channels_last)
 

@@ -189,7 +189,7 @@ class MappingConfig(Section):
     max_depth_difference: float = Field(
         default=0.1, gt=0, description="largest relative difference to the depth of a neighbouring keyframe"
     )
-    max_relative_sigma: float = Field(default=0.2, gt=0, description="largest sigma of fused depth, over the depth")
+    max_relative_sigma: float = Field(default=0.3, gt=0, description="largest sigma of fused depth, over the depth")
     min_weight: float = Field(
         default=1.0, ge=0, description="least number of observations of a voxel that becomes surface"
     )

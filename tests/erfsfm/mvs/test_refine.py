@@ -1,12 +1,15 @@
-"""Refined depth on rendered scenes with exact poses: walls, a step, the sky and a car that drives ahead."""
+"""Depth refined by rules and by the network, on rendered scenes with exact poses: walls, a step, the sky and a car that drives ahead."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pytest
 
 from erfsfm.mvs.appearance import Appearance
+from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import RefinedDepth, Road, refine
 
 H, W = 96, 240
@@ -52,18 +55,28 @@ def road_and_car(position: tuple[float, float, float], frame: float) -> tuple[np
     return image.astype(np.uint8), np.where(car, 8.0, depth).astype(np.float32), car
 
 
-def refined(images: list[np.ndarray], prior: np.ndarray, road: Road | None = None) -> RefinedDepth:
-    """The first image, refined by the others at ``POSITIONS``."""
+def refined(
+    images: list[np.ndarray],
+    prior: np.ndarray,
+    road: Road | None = None,
+    by: Callable[..., RefinedDepth] = refine,
+    unit: float = 1.0,
+) -> RefinedDepth:
+    """The first image, refined by the others at ``POSITIONS``; a metre is so many units."""
     T = np.tile(np.eye(4), (len(POSITIONS), 1, 1))
-    T[:, :3, 3] = -np.array(POSITIONS)
+    T[:, :3, 3] = -unit * np.array(POSITIONS)
     target, *others = (Appearance.of(image) for image in images)
-    return refine(target, prior.astype(np.float32), others, K, T, road)
+    return by(target, (unit * prior).astype(np.float32), others, K, T, road)
 
 
-def test_a_wall_and_a_step_are_found_from_a_wrong_guess() -> None:
+BOTH = pytest.mark.parametrize("by", [refine, DepthFusion("default").refine], ids=["rules", "network"])
+
+
+@BOTH
+def test_a_wall_and_a_step_are_found_from_a_wrong_guess(by: Callable[..., RefinedDepth]) -> None:
     images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     truth = wall_and_step((0.0, 0.0, 0.0))[1]
-    found = refined(images, np.full((H, W), 9.0))
+    found = refined(images, np.full((H, W), 9.0), by=by)
     error = np.abs(found.depth - truth) / truth
     assert np.median(error) < 0.02
     assert (error < 0.1).mean() > 0.93
@@ -121,8 +134,17 @@ def test_a_car_that_drives_ahead_keeps_the_guess(guess: float) -> None:
     assert np.median(found.relative_sigma[lower]) >= 0.15
 
 
-def test_sizes_that_are_odd() -> None:
+@BOTH
+def test_the_unit_of_length_does_not_matter(by: Callable[..., RefinedDepth]) -> None:
+    images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
+    metres, feet = (refined(images, np.full((H, W), 9.0), by=by, unit=unit) for unit in (1.0, 1 / 0.3048))
+    np.testing.assert_allclose(np.median(feet.depth * 0.3048 / metres.depth), 1, atol=1e-4)
+    np.testing.assert_allclose(feet.depth * 0.3048, metres.depth, rtol=0.02)
+
+
+@BOTH
+def test_sizes_that_are_odd(by: Callable[..., RefinedDepth]) -> None:
     images = [wall_and_step(position)[0][:-1, :-1] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
-    found = refined(images, np.full((H - 1, W - 1), 9.0))
+    found = refined(images, np.full((H - 1, W - 1), 9.0), by=by)
     assert found.depth.shape == found.relative_sigma.shape == (H - 1, W - 1)
     assert np.isfinite(found.depth).all() and (found.depth > 0).all()

@@ -49,7 +49,18 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(tmp_path: Path, comman
         simulate = ["simulate", str(tmp_path / f"{seed}"), "--seed", str(seed), "--frames", "20", "--route", "grid"]
         subprocess.run([sys.executable, "-m", "slam", *simulate, "--depth"], check=True, capture_output=True)
     roots = ["--dataset", tmp_path / "3", "--validation", tmp_path / "4"]
-    words = ["train-fusion", *roots, "--output", tmp_path / "net", "--weights", "sim", "--samples", "80", "--steps", "20"]
+    words = [
+        "train-fusion",
+        *roots,
+        "--output",
+        tmp_path / "net",
+        "--weights",
+        "sim",
+        "--samples",
+        "80",
+        "--steps",
+        "20",
+    ]
     code, out, _ = command_line(main, "erfsfm", *words, "--json")
     (metrics,) = json.loads(out)
     assert code == 0 and metrics["fused_mean"] < metrics["guess_mean"]
@@ -72,5 +83,7 @@ def test_worlds_without_depth_are_refused(tmp_path: Path, command_line: Cli) -> 
     simulate = [sys.executable, "-m", "slam", "simulate", str(world), "--frames", "6", "--route", "straight"]
     subprocess.run(simulate, check=True, capture_output=True)
     roots = ["--dataset", world, "--validation", world]
-    code, _, err = command_line(main, "erfsfm", "train-fusion", *roots, "--output", tmp_path / "net", "--samples", "8", "--steps", "1")
+    code, _, err = command_line(
+        main, "erfsfm", "train-fusion", *roots, "--output", tmp_path / "net", "--samples", "8", "--steps", "1"
+    )
     assert code == 1 and "--depth" in err and len(err.strip().splitlines()) == 1

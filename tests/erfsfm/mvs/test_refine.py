@@ -1,4 +1,4 @@
-"""Depth refined by rules and by the network, on rendered scenes with exact poses: walls, a step, the sky and a car that drives ahead."""
+"""Depth refined by rules and by the network, on rendered scenes with exact poses: walls, a step, sky, a car ahead."""
 
 from __future__ import annotations
 

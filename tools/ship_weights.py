@@ -5,12 +5,11 @@ Example: python tools/ship_weights.py runs/sim sim --data "60 simulated worlds, 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from shared.command import markdown, one_line_errors, parser_of
 
-from erfsfm.checkpoint import Model, load_model, save_model
+from erfsfm.checkpoint import load_model, save_model
 from erfsfm.model_record import FILES, SHIPPED
 
 LARGEST_MB = 20
@@ -30,9 +29,8 @@ CARD = """# Weights `{name}`
 | licence | {licence} |
 
 Trained without labels, from images and intrinsics alone. Depth and poses share one unit, about ten camera heights.
-{note}
 
-Measured (`{evaluation}`):
+Measured by the validation of the training:
 
 {metrics}
 """
@@ -46,46 +44,26 @@ def main() -> None:
     parser.add_argument("name", help="name of the shipped weights")
     parser.add_argument("--data", required=True, help="one line: what it was trained on")
     parser.add_argument("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
-    parser.add_argument("--command", help="in place of the recorded one, without the paths of one machine")
-    parser.add_argument("--note", default="", help="a paragraph for the card")
-    parser.add_argument("--metrics", type=Path, help="output of erfsfm evaluate ... --json")
-    parser.add_argument("--evaluation", default="validation of the training run", help="the command behind --metrics")
     arguments = parser.parse_args()
 
     model = load_model(arguments.run)
     folder = SHIPPED / arguments.name
-    record = model.record.model_copy(update={"command": arguments.command or model.record.command})
-    save_model(folder, Model(record, model.depth_net, model.pose_net), half=True)
+    save_model(folder, model, half=True)
     for file in FILES:
         size = (folder / file).stat().st_size / 1e6
         if size > LARGEST_MB:
             raise SystemExit(f"{file} has {size:.1f} MB; shipped weights have at most {LARGEST_MB}: train narrower")
-    network = record.network
+    record = model.record
     card = CARD.format(
         name=arguments.name,
-        **network.model_dump(),
-        frames=network.sources + 1,
-        data=arguments.data,
-        seen=", ".join(record.trained_on),
-        held_out=arguments.held_out,
-        steps=record.step,
-        command=record.command,
-        commit=record.commit,
-        licence=record.licence,
-        note=arguments.note,
-        evaluation=arguments.evaluation,
-        metrics=_table(arguments.metrics, record.metrics),
+        **record.network.model_dump(),
+        **record.model_dump(include={"command", "commit", "licence"}),
+        **{"data": arguments.data, "seen": ", ".join(record.trained_on), "held_out": arguments.held_out},
+        **{"frames": record.network.sources + 1, "steps": record.step},
+        metrics=markdown(list(record.metrics), [[f"{value:.4f}" for value in record.metrics.values()]]),
     )
     (folder / "README.md").write_text(card)
-    print(f"{folder}: read {folder / 'README.md'}")
-
-
-def _table(path: Path | None, fallback: dict[str, float]) -> str:
-    rows = json.loads(path.read_text()) if path else [fallback]
-    keys = list(rows[0])
-    return markdown(
-        keys, [[f"{row[k]:.4f}" if isinstance(row[k], float) else str(row[k]) for k in keys] for row in rows]
-    )
+    print(f"{folder}: read {folder / 'README.md'}, and say what else is to be known")
 
 
 if __name__ == "__main__":

@@ -124,7 +124,11 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
         "share of frames located": m.middle_and_extreme(handheld.LOCATED, min),
         "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
     }
-    rows = {"recordings": kind, "weights": weights, "published": lambda o: handheld.MARKS.get(kind(o), DASH)}
+    rows: dict[str, m.Label] = {
+        "recordings": kind,
+        "weights": weights,
+        "published": lambda o: handheld.MARKS.get(kind(o), DASH),
+    }
     return table(rows, columns, results)
 
 

@@ -44,10 +44,10 @@ PARAMETERS: dict[str, Any] = {
     "odom_frame": "odom",
     "base_frame": "",  # of the robot, such as base_link; "": the frame of the images, which then has no parent
     "publish_tf": "both",  # map_to_odom where the robot has an odometry of its own; none
-    "pose_every": 1,  # frames
-    "path_every": 10,  # frames
-    "loops_every": 0,  # frames; 0: by the service close_loops alone
-    "map_every": 50,  # frames; 0: after loops alone
+    "pose_every": 1,  # frames; here and below 0 is never
+    "path_every": 10,
+    "loops_every": 0,  # they are closed by the service close_loops, too
+    "map_every": 50,  # a map is made after loops, too
     "resolution": 0.25,  # of the map
     "keyframe_spacing": 1.0,
     "depth_to": 10.0,
@@ -100,14 +100,15 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
     def add(self, message: Image) -> None:
         """Measure an image and say where it was taken; one that cannot be used is left out and logged."""
         if self._slam is None or not self._knows_base(message.header):
-            self._say("no camera_info yet: images are left out" if self._slam is None else "no transform from the base")
+            lacking = "camera_info" if self._slam is None else f"transform from {self._of['base_frame']} to the camera"
+            self._say(f"no {lacking} yet: images are left out")
             return
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         try:
             image = image_of(message, f"the image at {stamp:.3f} s")
             self._slam.add_frame(self._undistortion.apply(image) if self._undistortion else image, stamp)
             self._publish(message.header)
-            if self._of["loops_every"] and len(self._slam) % self._of["loops_every"] == 0:
+            if self._is_due("loops_every"):
                 self._solve()
         except (SlamError, ErfsfmError, ValueError) as error:
             self.get_logger().error(str(error))
@@ -130,6 +131,10 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
 
     def _say(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=5.0)
+
+    def _is_due(self, name: str) -> bool:
+        """Whether it is the turn of what comes every so many frames; 0 is never."""
+        return bool(self._of[name]) and len(self._slam or ()) % self._of[name] == 0
 
     def _knows_base(self, image: Header) -> bool:
         """Find once where the camera is on the robot."""
@@ -164,9 +169,9 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         T_map_camera, count = self._T_map_camera(), len(self._slam)
         header = Header(stamp=image.stamp, frame_id=self._of["map_frame"])
         self._publish_tf(T_map_camera @ invert(self._T_base_camera), header, image.frame_id)
-        if count % self._of["pose_every"] == 0:
+        if self._is_due("pose_every"):
             self._pose.publish(PoseStamped(header=header, pose=pose_of(T_map_camera[-1])))
-        if count % self._of["path_every"] == 0:
+        if self._is_due("path_every"):
             stamps = (Time(nanoseconds=round(1e9 * stamp)).to_msg() for stamp in self._slam.trajectory().stamps)
             headers = [Header(stamp=stamp, frame_id=header.frame_id) for stamp in stamps]
             poses = [PoseStamped(header=h, pose=pose_of(T)) for h, T in zip(headers, T_map_camera)]
@@ -174,7 +179,7 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         if self._slam.unit_name is not None:
             for frame in self._map.add(self._slam.clouds(count - 1, STRIDE), T_map_camera):
                 self._keyframe.publish(points_of(self._map.clouds[frame], image))
-            if self._of["map_every"] and count % self._of["map_every"] == 0:
+            if self._is_due("map_every"):
                 self._publish_map()
 
     def _publish_tf(self, T_map_base: FloatArray, header: Header, camera: str) -> None:

@@ -235,7 +235,7 @@ def test_loops_move_the_map_and_not_the_odometry(
     assert not node.services["close_loops"](None, SimpleNamespace()).success
     node.callbacks["camera_info"](info_message(intrinsics.K, intrinsics.width, intrinsics.height))
     node.callbacks["image"](image_message(drive.frame(0).image, 0))
-    assert node.logged == ["no transform from the base"]
+    assert node.logged == ["no transform from base_link to the camera yet: images are left out"]
     placed = node_module.transform_of(T_base_camera, header(0), "front_optical").transform
     monkeypatch.setattr(Buffer, "known", {("base_link", "front_optical"): placed})
     for number in range(10):

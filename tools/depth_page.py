@@ -82,13 +82,14 @@ def _note(drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Show
     known = (truth >= EDGES_M[0]) & (truth < EDGES_M[-1])
     for method, depth in depths.items():
         size = (truth.shape[1], truth.shape[0])
-        guess = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)[known].astype(np.float64)
-        relative = np.abs(guess - truth[known]) / truth[known]
-        errors.setdefault(method, []).append(np.stack([truth[known], relative]))
+        guess = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float64)
+        both = known & np.isfinite(guess)
+        relative = np.abs(guess[both] - truth[both]) / truth[both]
+        errors.setdefault(method, []).append(np.stack([truth[both], relative]))
 
 
 def table(errors: Errors) -> str:
-    """Mean and median relative error of each method, whole and over distance, as Markdown."""
+    """Mean and median relative error of each method where it knows depth, whole and over distance, as Markdown."""
     bins = list(pairwise(EDGES_M))
     rows = []
     for method, parts in errors.items():

@@ -25,34 +25,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from benchmarking import handheld, kitti, pairs
+from benchmarking import handheld, kitti, page, pairs
+from benchmarking import plan as p
 from benchmarking.metrics import rows
-from benchmarking.page import (
-    PICTURE,
-    draw,
-    drawable,
-    handheld_summary,
-    section,
-    speed_section,
-    summary_table,
-    with_section,
-)
-from benchmarking.plan import (
-    ABLATION,
-    ACCURACY,
-    EVERYTHING,
-    FULL_SIZE,
-    MAPS,
-    WHOLE,
-    Condition,
-    Configuration,
-    Job,
-    original_recordings,
-    plan,
-    raw_drives,
-    recordings,
-    worlds,
-)
 from benchmarking.work import ROOT, measured, revision, simulate, workers
 from shared.command import one_line_errors, parser_of
 
@@ -64,7 +39,7 @@ class Mode:
     """What a mode measures, and the defaults of its options."""
 
     what: str
-    configurations: tuple[Configuration, ...]
+    configurations: tuple[p.Configuration, ...]
     routes: tuple[str, ...]
     worlds: tuple[int, ...] = (610,)
     weights: tuple[str, ...] = ("default",)
@@ -73,20 +48,15 @@ class Mode:
 
 _BOTH = ("loop", "straight")
 _ROOTS = ("kitti", "data", *handheld.ROOTS)  # options of data sets, which the page calls by these names
+# options that a section of the page does not state, or states by other names
+_UNSAID = {"mode", "output", "report", "jobs", "scheduler", "worlds_in", "drives", "folders", *_ROOTS}
 MODES = {
-    "accuracy": Mode(
-        "errors of network, odometry and optimised trajectory on every sequence",
-        ACCURACY,
-        _BOTH,
-        (610, 611),
-        ("default", "sim"),
-        (0, 1, 2),
-    ),
-    "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", ACCURACY, _BOTH, (610, 611)),
-    "ablation": Mode("the same with one part turned off at a time", ABLATION, _BOTH, weights=("default", "sim")),
-    "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", MAPS, ("loop",)),
-    "kitti": Mode("whole sequences of KITTI odometry, beside published errors", WHOLE, (), weights=("sim",)),
-    "handheld": Mode("errors, losses and waits of cameras that are carried", ACCURACY, ()),
+    "accuracy": Mode("errors of all trajectories", p.ACCURACY, _BOTH, (610, 611), ("default", "sim"), (0, 1, 2)),
+    "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", p.ACCURACY, _BOTH, (610, 611)),
+    "ablation": Mode("the same with one part turned off at a time", p.ABLATION, _BOTH, weights=("default", "sim")),
+    "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", p.MAPS, ("loop",)),
+    "kitti": Mode("whole sequences of KITTI odometry, beside published errors", p.WHOLE, (), weights=("sim",)),
+    "handheld": Mode("errors, losses and waits of cameras that are carried", p.ACCURACY, ()),
 }
 
 
@@ -110,26 +80,26 @@ def main(words: Sequence[str] | None = None) -> None:
         writer.writeheader()
         writer.writerows(table_of_runs)
     drives = [(path, "DRIVE") for name in ("drives", "folders") for path in getattr(options, name, ())]
-    text = section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
+    text = page.section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
     roots = [(getattr(options, name, None), name.upper()) for name in _ROOTS]
     known = (options.output, "OUTPUT"), (getattr(options, "worlds_in", None), "WORLDS"), *roots, (ROOT, "."), *drives
     for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
     _write_section(options.report, text)
     if options.mode in ("accuracy", "full-size"):
-        print(summary_table(results))
+        print(page.summary_table(results))
     if options.mode == "kitti":
         print(kitti.tables(results))
     if options.mode == "handheld":
-        print(handheld_summary(results))
-    if options.mode == "accuracy" and drawable(results):
-        draw(results, options.report.parent / PICTURE)
+        print(page.handheld_summary(results))
+    if options.mode == "accuracy" and page.drawable(results):
+        page.draw(results, options.report.parent / page.PICTURE)
     print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
 
 
 def _write_section(report: Path, text: str) -> None:
-    page = report.read_text(encoding="utf-8") if report.is_file() else ""
-    write_atomically(report, lambda file: file.write_text(with_section(page, text), encoding="utf-8"))
+    old = report.read_text(encoding="utf-8") if report.is_file() else ""
+    write_atomically(report, lambda file: file.write_text(page.with_section(old, text), encoding="utf-8"))
 
 
 def _compare_speed(options: argparse.Namespace) -> None:
@@ -144,7 +114,7 @@ def _compare_speed(options: argparse.Namespace) -> None:
         drives.append(pairs.Drive(folder.resolve().parent.name, ("--dataset", str(folder.resolve()))))
         command += ["--folders", f"DATA/{folder.resolve().parent.name}/{folder.name}"]
     if options.frames:
-        (grid,) = worlds((options.output / "worlds").resolve(), ["grid"], [610], options.frames)
+        (grid,) = p.worlds((options.output / "worlds").resolve(), ["grid"], [610], options.frames)
         simulate(grid)
         drives.append(pairs.Drive(f"grid 610, {options.frames} frames", ("--dataset", str(grid.root))))
     command += ["--frames", str(options.frames), "--pairs", str(options.pairs)]
@@ -154,45 +124,43 @@ def _compare_speed(options: argparse.Namespace) -> None:
     runs.mkdir(parents=True)
     costs = pairs.in_turn(checkouts, drives, options.pairs, runs)
     text = pairs.tables([revision(checkout) for checkout in checkouts], drives, costs)
-    _write_section(options.report, speed_section(shlex.join(command), text))
+    _write_section(options.report, page.speed_section(shlex.join(command), text))
     print(text)
 
 
-def _jobs(options: argparse.Namespace) -> list[Job]:
+def _jobs(options: argparse.Namespace) -> list[p.Job]:
     folder = options.output.resolve() / options.mode
     simulated = (options.worlds_in or options.output / "worlds").resolve()
     truth: tuple[Literal["depth"], ...] = ("depth",) if options.mode == "maps" else ()
-    size = FULL_SIZE if options.mode == "full-size" else None
+    size = p.FULL_SIZE if options.mode == "full-size" else None
     if options.mode == "handheld":
         drives = handheld.drives(options, simulated)
     else:
-        drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth, size)
-    drives += raw_drives(getattr(options, "drives", ()))
+        drives = p.worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth, size)
+    drives += p.raw_drives(getattr(options, "drives", ()))
     if getattr(options, "kitti", None) is not None:
-        drives += recordings(options.kitti.resolve(), options.sequences, options.excerpt)
+        drives += p.recordings(options.kitti.resolve(), options.sequences, options.excerpt)
     if getattr(options, "data", None) is not None:
-        drives += original_recordings(options.data.resolve())
+        drives += p.original_recordings(options.data.resolve())
     configurations = MODES[options.mode].configurations
     parts = getattr(options, "parts", None)
     if parts is not None:
-        configurations = tuple(c for c in configurations if c is EVERYTHING or c.name in parts)
+        configurations = tuple(c for c in configurations if c is p.EVERYTHING or c.name in parts)
     rest = options.weights, options.seeds, options.set, options.device
-    return plan(folder, drives, configurations, *rest)
+    return p.plan(folder, drives, configurations, *rest)
 
 
-def _whole_sequences(options: argparse.Namespace) -> list[Job]:
+def _whole_sequences(options: argparse.Namespace) -> list[p.Job]:
     """The sequences that are there; says which are not, and how long the others take."""
     root = options.kitti.resolve()
     frames, absent = kitti.present(root, options.sequences)
     for line in absent:
         print(f"left out: {line}", file=sys.stderr)
     if not frames:
-        raise SystemExit(
-            f"nothing to measure: {root} has none of these sequences with true poses; give another --kitti"
-        )
+        raise SystemExit(f"nothing to measure: {root} has none of these with true poses; give another --kitti")
     rest = options.weights, options.seeds, options.set, options.device
     folder = options.output.resolve() / options.mode
-    jobs = plan(folder, recordings(root, list(frames), None), MODES["kitti"].configurations, *rest)
+    jobs = p.plan(folder, p.recordings(root, list(frames), None), MODES["kitti"].configurations, *rest)
     print(kitti.time_to_go(jobs, frames, options.jobs), file=sys.stderr)
     return jobs
 
@@ -200,37 +168,15 @@ def _whole_sequences(options: argparse.Namespace) -> list[Job]:
 def _command(options: argparse.Namespace) -> str:
     """The command with its defaults, without the paths and hosts of one machine."""
     words = ["python", "tools/benchmark.py", options.mode]
-    words += [
-        word
-        for name in _ROOTS
-        if getattr(options, name, None)
-        for word in (f"--{name.replace('_', '-')}", name.upper())
-    ]
+    for name in _ROOTS:
+        words += [f"--{name.replace('_', '-')}", name.upper()] if getattr(options, name, None) else []
     drives = getattr(options, "drives", ())
     names = [f"KITTI_RAW/{drive.resolve().parent.name}/{drive.name}" for drive in drives]
     words += ["--drives", *names] if names else []
     folders = [f"DATA/{folder.resolve().parent.name}/{folder.name}" for folder in getattr(options, "folders", ())]
     words += ["--folders", *folders] if folders else []
-    for name in (
-        "weights",
-        "routes",
-        "worlds",
-        "frames",
-        "conditions",
-        "parts",
-        "sequences",
-        "excerpt",
-        "seeds",
-        "device",
-        "rooms",
-        "motions",
-        "rates",
-        "hazards",
-        "seconds",
-        "set",
-    ):
-        value = getattr(options, name, None)
-        if value not in (None, ()):
+    for name, value in vars(options).items():
+        if name not in _UNSAID and value not in (None, ()):
             words += [f"--{name}", *map(str, value if isinstance(value, list | tuple) else [value])]
     return shlex.join(words)
 
@@ -263,7 +209,7 @@ def _parser() -> argparse.ArgumentParser:
             add("--excerpt", metavar="A:B", help="frames of the sequences of --kitti, half-open")
         if name in ("maps", "ablation"):
             add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
-            parts = [each.name for each in mode.configurations if each is not EVERYTHING]
+            parts = [each.name for each in mode.configurations if each is not p.EVERYTHING]
             add("--parts", nargs="*", choices=parts, metavar="PART", help=f"to turn off: {', '.join(parts)}; else all")
         add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")
         add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
@@ -287,7 +233,7 @@ def _add_worlds(add: Callable[..., object], mode: Mode) -> None:
     add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
     add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
     add("--frames", type=int, default=300, help="their length")
-    add("--conditions", nargs="+", choices=get_args(Condition), default=["clean"], help="hazards: all at once")
+    add("--conditions", nargs="+", choices=get_args(p.Condition), default=["clean"], help="hazards: all at once")
     add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
 
 

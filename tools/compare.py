@@ -18,6 +18,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -140,7 +141,8 @@ def _peer_run(each: Compared, drive: BenchmarkSequence, folder: Path, options: a
         _write_recording(drive, each.features, folder)
         words = [str(options.orb_python.absolute()), str(PEER), str(folder)]
         words += [str(options.vocabulary.resolve()), str(options.pace)]
-        finished = subprocess.run(words, capture_output=True, text=True, check=False, env=_without_our_path())
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        finished = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
         (folder / "frames.raw").unlink()
         reason = why_ended(finished.returncode, finished.stderr)
         if reason:
@@ -149,10 +151,6 @@ def _peer_run(each: Compared, drive: BenchmarkSequence, folder: Path, options: a
     record = json.loads((folder / "record.json").read_text())
     trajectory = folder / "trajectory.tum"
     return PeerRun(read_trajectory(trajectory, "tum") if trajectory.is_file() else None, record)
-
-
-def _without_our_path() -> dict[str, str]:
-    return {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
 
 
 def _write_recording(drive: BenchmarkSequence, features: int, folder: Path) -> None:
@@ -203,10 +201,6 @@ def _ours(pair: Pair, name: str = "optimised") -> Trajectory | None:
     return None if result.reason else RunFolder.open(result.job.place / "run").trajectory(name)
 
 
-def _poses(trajectory: Trajectory | None) -> str:
-    return "0" if trajectory is None else str(len(trajectory))
-
-
 def _of(definition: m.MetricDefinition, of: Callable[[Pair], JobResult]) -> Callable[[Pair], str]:
     return lambda pair: m.average(definition)([of(pair)])
 
@@ -229,20 +223,13 @@ def _peer_number(key: str) -> Callable[[Pair], str]:
     return lambda pair: f"{pair.peer.record[key]:.0f}" if key in pair.peer.record else DASH
 
 
-def _with(pair: Pair) -> JobResult:
-    return pair.with_map
-
-
-def _without(pair: Pair) -> JobResult:
-    return pair.without_map
-
-
+_with, _without = attrgetter("with_map"), attrgetter("without_map")
 _ACCURACY: dict[str, Callable[[Pair], str]] = {
     "recording": lambda pair: pair.name,
     "frames": _of(m.FRAMES, _without),
     "path (m)": _of(m.LENGTH, _without),
-    "poses, ours": lambda pair: _poses(_ours(pair)),
-    "poses, ORB-SLAM3": lambda pair: _poses(pair.peer.trajectory),
+    "poses, ours": lambda pair: str(len(_ours(pair) or ())),
+    "poses, ORB-SLAM3": lambda pair: str(len(pair.peer.trajectory or ())),
     "ATE, ours": lambda pair: _ate(_ours(pair), _ours(pair, "reference"), pair.peer.trajectory),
     "ATE, ORB-SLAM3": lambda pair: _ate(pair.peer.trajectory, _ours(pair, "reference")),
     "all frames, ours": lambda pair: _ate(_ours(pair), _ours(pair, "reference")),

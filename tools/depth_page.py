@@ -91,9 +91,10 @@ def _note(
     known = (truth >= EDGES_M[0]) & (truth < EDGES_M[-1])
     for method, depth in depths.items():
         size = (truth.shape[1], truth.shape[0])
-        guess = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)[known].astype(np.float64)
-        relative = np.abs(guess - truth[known]) / truth[known]
-        errors.setdefault(method, {})[keyframe.frame] = np.stack([truth[known], relative])
+        guess = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float64)
+        both = known & np.isfinite(guess)
+        relative = np.abs(guess[both] - truth[both]) / truth[both]
+        errors.setdefault(method, {})[keyframe.frame] = np.stack([truth[both], relative])
 
 
 def table(errors: Errors) -> str:
@@ -127,39 +128,23 @@ def picture(rows: Sequence[Shown]) -> Image:
         cells = [np.asarray(cv2.resize(row.image, (WIDTH_PX, height), interpolation=cv2.INTER_AREA), np.uint8)]
         cells += [coloured(row.depths[name], height) for name in names]
         if row.truth is not None:
-            cells.append(_sparse(row.truth, height))
+            cells.append(coloured(row.truth, height, cv2.INTER_NEAREST))
         lines.append(
             np.concatenate([np.pad(cell, ((0, RIM_PX), (0, RIM_PX), (0, 0)), constant_values=255) for cell in cells], 1)
         )
     head = np.full((24, lines[0].shape[1], 3), 255, np.uint8)
     for column, title in enumerate(titles):
-        cv2.putText(
-            head,
-            title,
-            (column * (WIDTH_PX + RIM_PX) + 4, 17),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.5,
-            (0, 0, 0),
-            1,
-            cv2.LINE_AA,
-        )
+        place = column * (WIDTH_PX + RIM_PX) + 4, 17
+        cv2.putText(head, title, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([head, *lines])
 
 
-def coloured(depth: DepthMap, height: int) -> Image:
-    """Inverse depth on one scale for all: bright is near, 4 m and nearer the brightest, unknown grey."""
+def coloured(depth: DepthMap, height: int, interpolation: int = cv2.INTER_AREA) -> Image:
+    """Inverse depth on one scale for all: bright is near, 4 m and nearer the brightest; few points are enlarged."""
     inverse = np.where(depth > 0, NEAREST_M / np.maximum(depth, 1e-6), 0).astype(np.float32)
-    inverse = cv2.resize(inverse, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
-    shade = np.clip(np.sqrt(inverse) * 255, 0, 255).astype(np.uint8)
-    return np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
-
-
-def _sparse(truth: DepthMap, height: int) -> Image:
-    """As `coloured`; points of LiDAR are enlarged to be seen, and what has no truth is grey."""
-    inverse = np.where(truth > 0, NEAREST_M / np.maximum(truth, 1e-6), 0).astype(np.float32)
-    if (truth > 0).mean() < 0.5:
+    if (depth > 0).mean() < 0.5:
         inverse = cv2.dilate(inverse, np.ones((5, 3), np.uint8))
-    inverse = cv2.resize(inverse, (WIDTH_PX, height), interpolation=cv2.INTER_NEAREST)
+    inverse = cv2.resize(inverse, (WIDTH_PX, height), interpolation=interpolation)
     shade = np.clip(np.sqrt(inverse) * 255, 0, 255).astype(np.uint8)
     colours = np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
     colours[inverse == 0] = 128

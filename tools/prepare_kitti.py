@@ -8,9 +8,7 @@ Example: python tools/prepare_kitti.py KITTI small --width 416 --height 128 --wo
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,8 +16,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from shared.command import one_line_errors, parser_of
 
-from erfsfm.common.errors import DataError, ErfsfmError
+from erfsfm.common.errors import DataError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.readers.images import image_size, list_images, read_values, resize_image
 
@@ -46,9 +45,10 @@ class Job:
     size: Size | None = None
 
 
+@one_line_errors()
 def main() -> None:
     """Write the small copy."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("root", type=Path, help="odometry root (sequences/NN), or raw root (2011_09_26/..._sync)")
     parser.add_argument("output", type=Path, help="receives the same layout")
     parser.add_argument("--width", type=int, default=416, help="of the images, pixels")
@@ -58,20 +58,8 @@ def main() -> None:
     parser.add_argument("--jpg", action="store_true", help="write jpg, also of png")
     parser.add_argument("--workers", type=int, default=2, help="threads")
     arguments = parser.parse_args()
-    try:
-        size = Size(arguments.width, arguments.height)
-        written, kept = prepare(
-            arguments.root,
-            arguments.output,
-            size,
-            arguments.sequence,
-            arguments.scans,
-            arguments.jpg,
-            arguments.workers,
-        )
-    except (ErfsfmError, OSError) as error:
-        print(f"prepare_kitti: {error}", file=sys.stderr)
-        raise SystemExit(1) from error
+    size, choice = Size(arguments.width, arguments.height), (arguments.sequence, arguments.scans, arguments.jpg)
+    written, kept = prepare(arguments.root, arguments.output, size, *choice, arguments.workers)
     print(f"{written} files written, {kept} kept in {arguments.output}")
 
 

@@ -44,45 +44,18 @@ FIELDS = {
     "real_re": "RE, KITTI",
 }
 
-PAGE = """# Does a wider receptive field help?
+REPORT = """`{command}`
 
-The paper's question, for the pose networks here. Every one is trained under one budget, supervised by the poses of the
-[many-view teacher](learning.md#a-teacher-of-many-views), and measured on snippets of frames that none of them
-saw. Networks are paired by seed: a pair has the same draws of snippets.
-
-`{pack}`
-
-`{command}`
-
-{steps} steps of {batch} snippets at {width}x{height} and width {pose_width}, learning rate {rate:g}.
-{seeds} seeds; {training} drives and worlds. Mean and standard deviation over seeds of snippet ATE and RE (radians) on
-{simulated} snippets of simulated worlds 600 to 602 and {real} of KITTI 00, 02 and 05 (frames 250 to 299). CPU seconds
-are those of one training with one thread.
+{steps} steps of {batch} snippets at {width}x{height} and width {pose_width}, learning rate {rate:g}; {seeds} seeds;
+{training} drives and worlds. Mean and standard deviation over seeds of snippet ATE and RE (radians) on {unseen} unseen
+snippets; CPU seconds of one training with one thread.
 
 {table}
-
-![Errors of every training](images/receptive_field_study.png)
-
-## Differences
 
 Ratio of the errors of a wider network and its plain one: geometric mean over the pairs, and its {level:.0f} % interval
 (Student's t on the logarithms).
 
 {differences}
-
-{conclusion}
-
-By chance alone one interval in {odds:.0f} leaves out 1, so a single one is weak evidence.
-
-The learning rate was chosen on `posenet`, from two, by a training of 1,500 and one of 3,000 steps measured on the same
-unseen snippets; other networks may want another. Networks from scratch have not converged: `posenet` at 7e-4 had RE
-0.065 on the worlds after 1,000 steps of its own schedule and 0.028 after 3,000.
-
-## Depth networks
-
-They were compared at three seeds under two views and the photometric error, with this tool as of commit a0efc53c4632.
-AbsRel on unseen worlds: `depthnet` 0.228 ± 0.009, `erf-depthnet-dilated` 0.232 ± 0.003, `erf-depthnet-dfc`
-0.230 ± 0.010, `erf-depthnet-dfcv2` 0.282 ± 0.040. None differs clearly from the plain one.
 """
 
 
@@ -130,7 +103,7 @@ class UnseenSnippets:
 
 @one_line_errors()
 def main() -> None:
-    """Train what is missing, measure, write the page."""
+    """Train what is missing, measure, print tables."""
     parser = parser_of(__doc__)
     parser.add_argument("--dataset", type=Path, action="append", required=True, help="to train and to measure on")
     parser.add_argument("--cache", type=Path, required=True, help="the teacher's poses; made where missing")
@@ -139,7 +112,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--networks", nargs="+", default=NETWORKS, choices=NETWORKS, help="only these")
     parser.add_argument("--output", type=Path, default=Path("runs/study"), help="receives every training")
-    parser.add_argument("--report", type=Path, help="page to write; the last one is in docs/design/networks.md")
+    parser.add_argument("--report", type=Path, help="file for what is printed; the last is in docs/design/networks.md")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
@@ -156,8 +129,10 @@ def main() -> None:
             row = measured(of_run(common, pose, seed), arguments.output / f"{pose}_{seed}", unseen)
             rows.append(row)
             print(json.dumps(asdict(row)), file=sys.stderr, flush=True)
+    text = report(rows, common, len(training), unseen)
+    print(text)
     if arguments.report:
-        write_page(arguments.report, rows, common, len(training), unseen)
+        write_atomically(arguments.report, lambda path: path.write_text(text))
 
 
 def of_run(common: ExperimentConfig, pose: str, seed: int) -> ExperimentConfig:
@@ -185,40 +160,19 @@ def measured(config: ExperimentConfig, folder: Path, unseen: dict[str, UnseenSni
     return row
 
 
-def write_page(
-    report: Path,
-    rows: Sequence[StudyRow],
-    config: ExperimentConfig,
-    training: int,
-    unseen: dict[str, UnseenSnippets],
-) -> None:
-    """Table, picture and what follows from them."""
-    figure = report.parent / "images" / "receptive_field_study.png"
-    figure.parent.mkdir(parents=True, exist_ok=True)
-    draw(figure, rows)
-    page = PAGE.format(
-        pack="erfsfm pack --config study --dataset worlds --dataset KITTI --dataset folders "
-        "--quality 95 --set teacher.cache=labels --output pack",
+def report(rows: Sequence[StudyRow], config: ExperimentConfig, training: int, unseen: dict[str, UnseenSnippets]) -> str:
+    """Both tables under their command."""
+    seeds, settings = len({row.seed for row in rows}), config.training
+    return REPORT.format(
         command="python tools/study_receptive_field.py --dataset pack --cache labels "
-        f"--seeds {len({row.seed for row in rows})} --networks {' '.join(by_network(rows))} "
-        f"--report {report.name}",
-        steps=config.training.steps,
-        rate=config.training.learning_rate,
-        batch=config.training.batch,
-        width=config.network.width,
-        height=config.network.height,
-        pose_width=config.network.pose_width,
-        seeds=len({row.seed for row in rows}),
-        training=training,
-        simulated=len(unseen["simulated"].samples),
-        real=len(unseen["real"].samples),
+        f"--seeds {seeds} --networks {' '.join(by_network(rows))}",
+        **config.network.model_dump(include={"width", "height", "pose_width"}),
+        **{"steps": settings.steps, "batch": settings.batch, "rate": settings.learning_rate},
+        **{"seeds": seeds, "training": training, "level": 100 * LEVEL},
+        unseen=", ".join(f"{len(snippets.samples)} {kind}" for kind, snippets in unseen.items()),
         table=table(rows, config.network.pose_width),
-        odds=1 / (1 - LEVEL),
-        level=100 * LEVEL,
         differences=differences(rows),
-        conclusion=conclusion(rows),
     )
-    write_atomically(report, lambda path: path.write_text(page))
 
 
 def by_network(rows: Sequence[StudyRow]) -> dict[str, list[StudyRow]]:
@@ -262,53 +216,14 @@ def ratio_interval(plain: Sequence[StudyRow], wider: Sequence[StudyRow], field: 
     return float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half))
 
 
-def _wider(runs: dict[str, list[StudyRow]]) -> list[str]:
-    """Networks of wider fields, where the plain one was trained too."""
-    return [name for name in runs if name != PLAIN] if PLAIN in runs else []
-
-
 def differences(rows: Sequence[StudyRow]) -> str:
-    """Each wider network against the plain one."""
+    """Each wider network against the plain one, where that was trained too."""
     runs = by_network(rows)
     cells = []
-    for name in _wider(runs):
+    for name in [name for name in runs if name != PLAIN and PLAIN in runs]:
         ratios = ["{:.2f} ({:.2f} to {:.2f})".format(*ratio_interval(runs[PLAIN], runs[name], f)) for f in FIELDS]
         cells.append([f"`{name}` / `{PLAIN}`", *ratios])
     return markdown(["pair", *FIELDS.values()], cells)
-
-
-def conclusion(rows: Sequence[StudyRow]) -> str:
-    """Which intervals exclude no difference."""
-    runs = by_network(rows)
-    lines = []
-    for name in _wider(runs):
-        better, worse = [], []
-        for field, label in FIELDS.items():
-            _, low, high = ratio_interval(runs[PLAIN], runs[name], field)
-            better += [label] if high < 1 else []
-            worse += [label] if low > 1 else []
-        parts = [f"{word} in {', '.join(found)}" for word, found in (("better", better), ("worse", worse)) if found]
-        said = f"is {' and '.join(parts)} than" if parts else "does not differ clearly from"
-        lines.append(f"- `{name}` {said} `{PLAIN}`.")
-    return "\n".join(lines)
-
-
-def draw(path: Path, rows: Sequence[StudyRow]) -> None:
-    """One dot a training, a bar at each mean."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 6), layout="constrained")
-    runs = by_network(rows)
-    for axes, (field, label) in zip(figure.subplots(2, 2).flat, FIELDS.items()):
-        for place, each in enumerate(runs.values()):
-            values = [getattr(row, field) for row in each]
-            axes.plot([place] * len(values), values, "o", color="tab:blue", alpha=0.6)
-            axes.plot([place - 0.25, place + 0.25], [np.mean(values)] * 2, "-", color="black")
-        axes.set_xticks(range(len(runs)), [name.replace("-posenet-", "-posenet\n-") for name in runs], fontsize=8)
-        axes.set_ylabel(label)
-        axes.set_ylim(bottom=0)
-        axes.grid(axis="y", alpha=0.3)
-    figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

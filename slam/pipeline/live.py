@@ -15,6 +15,7 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
+from slam.frontend.drive import Keyframe
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
 from slam.loops.structure import PlaceStructure
@@ -63,7 +64,7 @@ class Slam:
         Args:
             predictor: depth and snippet poses; ``config.depth`` is read by `from_weights` alone.
             intrinsics: of all images.
-            config: None for the defaults; with ``output.keep=keyframes`` images are kept on disk, for `surface`.
+            config: None for the defaults; ``output.keep=keyframes`` keeps images on disk, for `surface` and `clouds`.
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
             update_frames: lengths of the last steps are solved after so many frames.
             sweep_frames: the whole drive is solved after so many frames, which takes longer the longer it is; 0: only
@@ -83,8 +84,8 @@ class Slam:
                 f"wanted update_frames >= 1, sweep_frames >= 0 and a seed of 31 bits; got {update_frames}, "
                 f"{sweep_frames} and {seed}"
             )
-        mapping = config.mapping.model_copy(update={"enabled": config.output.keep == "keyframes"})
-        config = config.model_copy(update={"mapping": mapping})
+        kept = {"enabled": config.output.keep == "keyframes"}
+        config = config.model_copy(update={"mapping": config.mapping.model_copy(update=kept)})
         self._weights_sha256 = weights_sha256
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed
@@ -261,7 +262,7 @@ class Slam:
             SlamError: there are too few usable frames, or the graph has no solution.
         """
         estimate = self._solved()
-        return estimate.optimised.select(np.array([view.index for view in estimate.views], dtype=np.intp))
+        return estimate.optimised.select(np.array([view.index for view in estimate.views], np.intp))
 
     @in_turn
     def points(self) -> FloatArray:
@@ -278,8 +279,7 @@ class Slam:
             pairs = zip(places.T_world_camera, places.views, strict=True)
             of_views = [apply(T, view.points.astype(np.float64)) for T, view in pairs]
         points = np.concatenate(of_views)
-        known: FloatArray = points[np.isfinite(points).all(axis=1)]
-        return known
+        return np.asarray(points[np.isfinite(points).all(axis=1)])
 
     @in_turn
     def marginals(self, frame: int) -> FloatArray:
@@ -299,6 +299,23 @@ class Slam:
         with tempfile.TemporaryDirectory(prefix="erfsfm-slam-surface-") as folder:
             fused.surface().write_mesh(Path(folder) / MAP_MESH)
             return import_open3d().io.read_triangle_mesh(str(Path(folder) / MAP_MESH))
+
+    @in_turn
+    def clouds(self, first: int = 0, stride: int = 4) -> dict[int, FloatArray]:
+        """Learned depth of each frame kept since ``first``: points ``(M, 3)`` in its camera, in `unit_name`.
+
+        Of every ``stride``-th pixel. Without ``output.keep=keyframes`` no frame is kept.
+        """
+        self._observer.flush()
+        kept = self._observer.drive.keyframes
+        return {each.index: self._cloud(each, stride) for each in kept if each.index >= first}
+
+    def _cloud(self, keyframe: Keyframe, stride: int) -> FloatArray:
+        depth = keyframe.depth_unscaled
+        camera = self._sequence.intrinsics.resized(*depth.shape[::-1])
+        v, u = np.mgrid[: camera.height : stride, : camera.width : stride].reshape(2, -1)
+        points = camera.rays(np.column_stack([u, v])) * (self._poses.unit * depth[v, u, None])
+        return np.asarray(points[points[:, 2] > 0])
 
     def _solved(self) -> Estimate:
         """Of the whole drive so far."""

@@ -80,6 +80,11 @@ class LivePoses:
             T_world_camera[:, :3, 3] = 0.0
         return T_world_camera
 
+    @property
+    def unit(self) -> float:
+        """Of the poses over that of learned depth, at the newest frame; 1 while unknown."""
+        return self._unit or 1.0
+
     def add(self, observer: Observer) -> list[LivePose]:
         """The frames that the observer has finished since the last call."""
         drive = observer.drive
@@ -121,7 +126,7 @@ class LivePoses:
         elif motion is not None:
             T_before_frame = motion.relative_pose.T_from_to.copy()
         if T_before_frame is not self._T_previous_newest:
-            T_before_frame[:3, 3] *= self._unit or 1.0
+            T_before_frame[:3, 3] *= self.unit
         self._T_world_camera.append(self._T_world_camera[before] @ T_before_frame)
         self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
         return USUAL_SUPPORT if by_keyframes is not None else 0.0 if motion is None else motion.support

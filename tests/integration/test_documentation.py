@@ -100,7 +100,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     ),
     (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
     (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/live has folders and videos that go on"),
-    (r"slam_node.py", "rclpy is on no package index; tests/slam/commands/live runs its callbacks"),
+    (r"slam_node.py", "rclpy is no dependency; tests/slam/commands/live runs its callbacks"),
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
     (r"--dataset walk ", "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances"),
     (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/commands/localisation has short ones"),

@@ -104,7 +104,9 @@ def test_full_size_has_worlds_and_originals_of_kitti(tmp_path: Path) -> None:
     assert names == ["loop 610", "loop 611", "straight 610", "straight 611", "KITTI 00", "KITTI 03"]
     assert jobs[0].drive.root.name == "loop-610-300-1242x375-v1"
     assert jobs[0].drive.simulate[-4:] == ("--width", "1242", "--height", "375")
-    assert benchmark._command(options).startswith("python tools/benchmark.py full-size --data DATA --weights default")
+    assert benchmark._command(options).startswith(
+        "python tools/benchmark.py full-size --data DATA --routes loop straight"
+    )
     text = page.section("full-size", "", [work.JobResult(job, metrics(), "abc") for job in jobs], "1")
     assert text.startswith("## Full-size") and "| KITTI 03 | default | 100 |" in text and "![" not in text
 

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import functools
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from benchmarking.metrics import MetricDefinition
+from benchmarking.metrics import FRAMES, MetricDefinition
 from benchmarking.plan import BenchmarkSequence
-from benchmarking.work import JobResult
+from benchmarking.work import JobResult, ratio
 
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.metrics import Event
 from slam.runtime.storage.record import Missing
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.poses import known_poses
@@ -112,27 +111,15 @@ def _path(o: JobResult) -> float | Missing:
     return _error_and_path(o.job.place / "run", o.job.drive)[1] if not o.reason else Missing(o.reason)
 
 
-def _percent(o: JobResult) -> float | Missing:
-    ate, path = _ate(o), _path(o)
-    if isinstance(ate, Missing) or isinstance(path, Missing):
-        return ate
-    return 100.0 * ate / path if path else Missing("the camera does not move")
-
-
-def _events(o: JobResult) -> Sequence[Event] | Missing:
-    events: Sequence[Event] | Missing = o.metrics.tracking.events
-    return events
-
-
 def losses(o: JobResult) -> int | Missing:
     """How often the camera was lost."""
-    events = _events(o)
+    events = o.metrics.tracking.events
     return events if isinstance(events, Missing) else sum(each.event == "lost" for each in events)
 
 
 def first_map(o: JobResult) -> int | Missing:
     """Number of frames before the first map."""
-    events = _events(o)
+    events = o.metrics.tracking.events
     if isinstance(events, Missing):
         return events
     return next((each.frame for each in events if each.event == "map begun"), Missing("no map began"))
@@ -140,7 +127,7 @@ def first_map(o: JobResult) -> int | Missing:
 
 def longest_wait(o: JobResult) -> int | Missing:
     """Most frames from a loss until the camera was found again, or a new map began, or the recording ended."""
-    events, frames = _events(o), o.metrics.sequence.frames
+    events, frames = o.metrics.tracking.events, o.metrics.sequence.frames
     if isinstance(events, Missing):
         return events
     if isinstance(frames, Missing):
@@ -151,18 +138,16 @@ def longest_wait(o: JobResult) -> int | Missing:
     return max(waits, default=Missing("the camera was never lost"))
 
 
-def _located(o: JobResult) -> float | Missing:
-    located, frames = o.metrics.tracking.located_frames, o.metrics.sequence.frames
-    if isinstance(located, Missing):
-        return located
-    return frames if isinstance(frames, Missing) else located / frames
-
-
 ATE = MetricDefinition("ate_7dof_known_m", "ATE 7-dof (m)", _ate, 3)
 PATH = MetricDefinition("path_known_m", "path (m)", _path, 1)
-PERCENT = MetricDefinition("ate_7dof_known_percent", "% of path", _percent, 2)
+PERCENT = MetricDefinition("ate_7dof_known_percent", "% of path", lambda o: ratio(_ate(o), _path(o), 100.0), 2)
 LOSSES = MetricDefinition("losses", "losses", losses, 0)
 FIRST_MAP = MetricDefinition("frames_before_first_map", "frames before the first map", first_map, 0)
 NEW_MAP = MetricDefinition("frames_before_new_map", "most frames before a new map", longest_wait, 0)
-LOCATED = MetricDefinition("located_share", "share of frames located", _located, 3)
+LOCATED = MetricDefinition(
+    "located_share",
+    "share of frames located",
+    lambda o: ratio(o.metrics.tracking.located_frames, FRAMES.value(o), 1.0),
+    3,
+)
 DEFINITIONS = (ATE, PATH, PERCENT, LOSSES, FIRST_MAP, NEW_MAP, LOCATED)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from statistics import fmean, median, stdev
 from typing import Any
 
@@ -16,6 +17,8 @@ from slam.runtime.storage.record import Missing, known
 
 Label = Callable[[JobResult], str]
 Cell = Callable[[Sequence[JobResult]], str]
+drive, kind, weights = attrgetter("job.drive.name"), attrgetter("job.drive.kind"), attrgetter("job.weights")
+configuration = attrgetter("job.configuration.name")
 
 
 @dataclass(frozen=True)
@@ -48,13 +51,11 @@ FRAMES = MetricDefinition("frames", "frames", lambda o: o.metrics.sequence.frame
 LENGTH = MetricDefinition("length_m", "path (m)", lambda o: o.metrics.sequence.length_m, 0)
 ERRORS = tuple(_error(trajectory, dof) for dof in "76" for trajectory in ("network", "odometry", "optimised"))
 ATE_7, ATE_6 = ERRORS[2], ERRORS[5]
-R_REL = MetricDefinition(
-    "r_rel_deg_per_100m",
-    "r_rel (deg / 100 m)",
-    lambda o: o.metrics.trajectories.optimised.align.dof7.r_rel_deg_per_100m,
-    2,
+_R_REL, _SCALE = (
+    attrgetter(f"metrics.trajectories.optimised.align.dof7.{name}") for name in ("r_rel_deg_per_100m", "scale")
 )
-SCALE = MetricDefinition("scale", "scale", lambda o: o.metrics.trajectories.optimised.align.dof7.scale, 3)
+R_REL = MetricDefinition("r_rel_deg_per_100m", "r_rel (deg / 100 m)", _R_REL, 2)
+SCALE = MetricDefinition("scale", "scale", _SCALE, 3)
 PERCENT = MetricDefinition("ate_7dof_optimised_percent", "% of path", lambda o: o.derived.optimised_percent, 2)
 NETWORK_PERCENT = MetricDefinition(
     "ate_7dof_network_percent", "network, % of path", lambda o: o.derived.network_percent, 2
@@ -177,18 +178,3 @@ def values(results: Sequence[JobResult], definition: MetricDefinition) -> list[f
 def mean(found: Sequence[float], decimals: int) -> str:
     """Mean of some numbers."""
     return f"{fmean(found):.{decimals}f}" if found else DASH
-
-
-def drive(o: JobResult) -> str:
-    """Name of the recording."""
-    return o.job.drive.name
-
-
-def weights(o: JobResult) -> str:
-    """Name of the weights."""
-    return o.job.weights
-
-
-def configuration(o: JobResult) -> str:
-    """Name of the configuration."""
-    return o.job.configuration.name

@@ -13,7 +13,7 @@ from statistics import fmean
 import numpy as np
 from benchmarking import handheld, kitti
 from benchmarking import metrics as m
-from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, over_seeds, table, values, weights
+from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, kind, over_seeds, table, values, weights
 from benchmarking.plan import EVERYTHING
 from benchmarking.work import FALSE_DEG, FALSE_M, JobResult
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -124,7 +124,11 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
         "share of frames located": m.middle_and_extreme(handheld.LOCATED, min),
         "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
     }
-    rows = {"recordings": kind, "weights": weights, "published": lambda o: handheld.MARKS.get(kind(o), DASH)}
+    rows: dict[str, m.Label] = {
+        "recordings": kind,
+        "weights": weights,
+        "published": lambda o: handheld.MARKS.get(kind(o), DASH),
+    }
     return table(rows, columns, results)
 
 
@@ -225,11 +229,6 @@ def summary_table(results: Sequence[JobResult]) -> str:
         "peak RSS (MiB)": m.middle_and_extreme(m.MEMORY, max),
     }
     return table({"drives": kind, "weights": weights}, columns, results)
-
-
-def kind(o: JobResult) -> str:
-    """Kind of the drive."""
-    return o.job.drive.kind
 
 
 def found(group: Sequence[JobResult]) -> str:

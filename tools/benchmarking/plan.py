@@ -46,6 +46,9 @@ QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 WHOLE = (Configuration("no map", (*QUIET, "mapping.enabled=false")),)
 EVERYTHING = Configuration("everything on", QUIET, True)
+_NO_JITTER = ("visual_odometry.jitter_rotation_ratio=0", "visual_odometry.jitter_direction_ratio=0")
+_NO_TURNS = ("visual_odometry.turn_rotation_ratio=0",)
+_NO_NEIGHBOURS = ("visual_odometry.neighbour_rotation_ratio=0", "visual_odometry.neighbour_direction_ratio=0")
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("visual_odometry.enabled=false",),
     "no predicted flow": ("visual_odometry.predicted_flow=false",),
@@ -57,19 +60,10 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
     "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
     "no short strip of road": ("road.near_heights=1e-3",),
-    "no sigma by jitter": ("visual_odometry.jitter_rotation_ratio=0", "visual_odometry.jitter_direction_ratio=0"),
-    "no sigma by turns": ("visual_odometry.turn_rotation_ratio=0",),
-    "no sigma by neighbouring steps": (
-        "visual_odometry.neighbour_rotation_ratio=0",
-        "visual_odometry.neighbour_direction_ratio=0",
-    ),
-    "no inflation of step sigmas": (
-        "visual_odometry.jitter_rotation_ratio=0",
-        "visual_odometry.jitter_direction_ratio=0",
-        "visual_odometry.turn_rotation_ratio=0",
-        "visual_odometry.neighbour_rotation_ratio=0",
-        "visual_odometry.neighbour_direction_ratio=0",
-    ),
+    "no sigma by jitter": _NO_JITTER,
+    "no sigma by turns": _NO_TURNS,
+    "no sigma by neighbouring steps": _NO_NEIGHBOURS,
+    "no inflation of step sigmas": (*_NO_JITTER, *_NO_TURNS, *_NO_NEIGHBOURS),
     "no gap interpolation": ("gaps.enabled=false",),
     "network factors only where image geometry fails": ("pose_network.use=gaps",),
     "no loops": ("loops.enabled=false",),
@@ -173,15 +167,11 @@ def worlds(
 
     def world(route: str, seed: int, condition: Condition) -> BenchmarkSequence:
         name, words = f"{route} {seed}", ("--route", route, "--seed", str(seed), "--frames", str(frames), *flags)
+        root = folder / f"{route}-{seed}-{frames}{beside}{'' if condition == 'clean' else '-hazards'}-v{VERSION}"
         if condition == "clean":
-            return BenchmarkSequence(
-                name, folder / f"{route}-{seed}-{frames}{beside}-v{VERSION}", simulate=words, kind=route
-            )
-        root = folder / f"{route}-{seed}-{frames}{beside}-{condition}-v{VERSION}"
-        simulate = (*words, "--hazards", every_hazard)
-        return BenchmarkSequence(
-            f"{name}, {condition}", root, simulate=simulate, kind=f"{route}, {condition}", clean=name
-        )
+            return BenchmarkSequence(name, root, simulate=words, kind=route)
+        words = (*words, "--hazards", every_hazard)
+        return BenchmarkSequence(f"{name}, hazards", root, simulate=words, kind=f"{route}, hazards", clean=name)
 
     return [world(route, seed, condition) for condition in conditions for route in routes for seed in seeds]
 

@@ -190,15 +190,16 @@ def derive_metrics(folder: Path, metrics: Metrics) -> DerivedMetrics:
     network, optimised = trajectories.network.align.dof7.ate_rmse_m, trajectories.optimised.align.dof7.ate_rmse_m
     fusion = stages if isinstance(stages, Missing) else stages.get("map", Missing("no map"))
     return DerivedMetrics(
-        _ratio(network, length, 100.0),
-        _ratio(optimised, length, 100.0),
-        _ratio(optimised, network, 1.0),
-        _ratio(fusion, metrics.map.frames_fused, 1e3),
+        ratio(network, length, 100.0),
+        ratio(optimised, length, 100.0),
+        ratio(optimised, network, 1.0),
+        ratio(fusion, metrics.map.frames_fused, 1e3),
         *_loops(folder, metrics),
     )
 
 
-def _ratio(part: float | Missing, whole: float | Missing, unit: float) -> float | Missing:
+def ratio(part: float | Missing, whole: float | Missing, unit: float) -> float | Missing:
+    """A part of a whole, in a unit."""
     if isinstance(part, Missing):
         return part
     if isinstance(whole, Missing):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.commands.localisation.localiser import Localisation, image_paths
 from slam.evaluation.map import pose_similarity
@@ -17,6 +18,7 @@ from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
 
 WITHIN_M, WITHIN_DEG = 0.5, 2.0
+_SAME_M = 1e-3  # between poses of one file and those of a run's reference
 _SIZES = ("error_m", "error_deg", "world_error_m", "world_error_deg")
 
 
@@ -78,8 +80,11 @@ class MapTruth:
         return PoseError(*_between(T_near_true, T_near_found), *_between(T_true_image, moved))
 
 
-def true_poses(truth: Path, images: Path, numbers: range) -> FloatArray:
+def true_poses(truth: Path, images: Path, numbers: range, T_true_camera: FloatArray) -> FloatArray:
     """True poses of the images of these numbers, ``(N, 4, 4)``, from a KITTI or TUM file with a row for each image.
+
+    They are in the world of a run's reference ``T_true_camera`` ``(M, 4, 4)``: where that is a part of the file they
+    are moved to its first camera, else the file is in that world already.
 
     Raises:
         SlamError: the file cannot be read, or has another number of rows than there are images.
@@ -87,7 +92,15 @@ def true_poses(truth: Path, images: Path, numbers: range) -> FloatArray:
     trajectory, count = read_trajectory(truth), len(image_paths(images))
     if len(trajectory) != count:
         raise RunError(f"{truth} has {len(trajectory)} poses and {images} {count} images: give each image a row")
-    return trajectory.T_world_camera[numbers.start : numbers.stop : numbers.step]
+    T_any_camera = trajectory.T_world_camera
+    chosen = T_any_camera[numbers.start : numbers.stop : numbers.step]
+    last = len(T_true_camera) - 1
+    T_first_last = invert(T_any_camera[: max(count - last, 0)]) @ T_any_camera[last:]
+    for first in np.flatnonzero(_is_same(T_first_last, T_true_camera[-1])).tolist():
+        T_world_any = invert(T_any_camera[first])
+        if _is_same(T_world_any @ T_any_camera[first : first + last + 1], T_true_camera).all():
+            return T_world_any @ chosen
+    return chosen
 
 
 def summary(errors: Sequence[PoseError | None]) -> dict[str, Any]:
@@ -119,6 +132,11 @@ def summary_line(numbers: dict[str, Any]) -> str:
         f"{numbers['median_error_deg']:.3f} deg, in the world {numbers['median_world_error_m']:.3f} m and "
         f"{numbers['median_world_error_deg']:.3f} deg"
     )
+
+
+def _is_same(T_a_b: FloatArray, T_other: FloatArray) -> NDArray[np.bool_]:
+    """Which of the poses ``(..., 4, 4)`` are those of a reference, but for the digits of files."""
+    return np.asarray(np.abs(T_a_b - T_other).max(axis=(-2, -1)) < _SAME_M)
 
 
 def _between(T_world_one: FloatArray, T_world_other: FloatArray) -> tuple[float, float]:

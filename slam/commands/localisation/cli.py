@@ -28,7 +28,8 @@ def localize(
     frames: Annotated[str | None, typer.Option(help="A:B of the images, half-open")] = None,
     every: Annotated[int, typer.Option(min=1, help="every n-th of them")] = 1,
     truth: Annotated[
-        Path | None, typer.Option(help="KITTI or TUM poses, a row an image, in the world of the run's reference")
+        Path | None,
+        typer.Option(help="KITTI or TUM poses, a row an image, of the run's file or in the world of its first camera"),
     ] = None,
     output: Annotated[Path | None, typer.Option(help="TUM file for the poses found; image numbers as stamps")] = None,
     as_json: Json = False,
@@ -52,7 +53,10 @@ def localize(
         if truth is not None and output.resolve() == truth.resolve():
             raise RunError(f"--output {output} is the file of --truth: choose another --output")
     numbers = image_numbers(images, frames, every)
-    known = None if truth is None else (MapTruth.of(run_folder), true_poses(truth, images, numbers))
+    known = None
+    if truth is not None:
+        of_map = MapTruth.of(run_folder)
+        known = of_map, true_poses(truth, images, numbers, of_map.T_true_camera)
     with progress_bar() as progress:
         found = []
         for localisation in localise(images, run_folder, camera, numbers):

@@ -37,6 +37,7 @@ from slam.sequences.images import ImageFiles
 from slam.sequences.undistortion import Undistortion
 
 _PLACES_TRIED = 8
+_STARTS = 3  # of these are refined
 _PLACES_AROUND = 12  # around the pose, whose points are looked for in the image
 _MOST_DIFFERING = 50  # bits of descriptors where the pose is known: less sure matches pull it towards itself
 _SAMPLES = 300  # of RANSAC
@@ -139,7 +140,7 @@ class Localiser:
         self._index = PlaceIndex(places.views)
 
     def locate(self, name: str, image: Image) -> Localisation:
-        """Localise an image ``(H, W, 3)`` uint8 RGB: at the similar place with most inliers, then in the map around it.
+        """Localise an image ``(H, W, 3)`` uint8 RGB: at similar places, then in the map around.
 
         Points of learned depth are used beside triangulated ones where both agree, else only if these are too few.
 
@@ -174,12 +175,20 @@ class Localiser:
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
     def _found(self, rows: list[int], view: View, learned: bool) -> _Pose | str:
-        """The pose by the place with most inliers, and by all corners of the map around it; or why there is none."""
-        starts = [self._start(row, view, learned) for row in rows]
-        best = max((start for start in starts if start is not None), key=lambda start: len(start[2]), default=None)
-        if best is None:
+        """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
+        starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
+        starts.sort(key=lambda start: len(start[2]), reverse=True)
+        found = [self._refined(start, rows, view, learned) for start in starts[:_STARTS]]
+        if not found:
             return "no place has corners that fit one pose"
-        T_camera_world = make(cv2.Rodrigues(best[0])[0], best[1])
+        poses = [each for each in found if isinstance(each, _Pose)]
+        return max(poses, key=lambda pose: pose.inliers) if poses else found[0]
+
+    def _refined(
+        self, start: tuple[FloatArray, FloatArray, NDArray[np.intp]], rows: list[int], view: View, learned: bool
+    ) -> _Pose | str:
+        """The pose by all corners of the map around a first one; or why it is none."""
+        T_camera_world = make(cv2.Rodrigues(start[0])[0], start[1])
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)

@@ -27,7 +27,7 @@ from slam.geometry.se3 import FloatArray
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
 logger = logging.getLogger(__name__)
-_LEAST_ROAD = 0.5  # of the frames; fewer see a floor or a table now and then
+_LEAST_ROAD = 1 / 3  # of the frames, half of which have learned depth; fewer see a floor or a table now and then
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 
 
@@ -128,13 +128,18 @@ def find_scale(
     elif isinstance(by_planes, MeasurementFailure):
         named = "the networks' own unit"
         logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
-    elif named == "camera heights" and by_planes.frames_used < _LEAST_ROAD * frames:
+    if named == "camera heights" and _frames_with_road(by_planes, used) < _LEAST_ROAD * frames:
         named = "no metric unit"
     if mode == "lidar" and not is_metric:
         estimate = MeasurementFailure("no step was measured by LiDAR, and the height of the camera is unknown")
         logger.warning("no metres (%s): lengths stay in %s", estimate.reason, named)
     contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
     return Scale(mode, estimate, per_frame, _measured_lengths(steps, solved), named, contradicted)
+
+
+def _frames_with_road(by_planes: ScaleEstimate | MeasurementFailure, steps: int) -> int:
+    """Frames that see a road by learned depth, or by the homography of so many steps."""
+    return max(steps, 0 if isinstance(by_planes, MeasurementFailure) else by_planes.frames_used)
 
 
 def _measured_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, StepLength]:

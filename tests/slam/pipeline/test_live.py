@@ -120,6 +120,11 @@ def test_a_session_gives_its_points_keyframes_marginals_and_surface() -> None:
     assert (near > 0).all() and (near < far).all() and far[5] < 1.0, "metres ahead"
     vertices = np.asarray(slam.surface().vertices)
     assert np.median(drive().street.distance_to_surface(apply(T_street_first, vertices[::50]))) < 1.0
+    clouds, poses = slam.clouds(first=10), slam.trajectory().T_world_camera
+    assert min(clouds) >= 10 and set(clouds) <= set(range(32))
+    for frame, cloud in clouds.items():
+        seen = apply(T_street_first @ poses[frame], cloud[cloud[:, 2] < 10.0])
+        assert len(seen) > 100 and np.median(drive().street.distance_to_surface(seen)) < 0.5
     with pytest.raises(SlamError, match="no frame 32"):
         slam.marginals(32)
     plain = started(load_config(None, SETTINGS))

@@ -18,6 +18,8 @@ async function runPacked(element) {
   const plots = [...document.querySelectorAll(".plot > div")];
   const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
+  const narrow = matchMedia("(max-width: 640px)");
+
   function template() {
     const line = { gridcolor: colour("--row"), zerolinecolor: colour("--line"), linecolor: colour("--line") };
     const axis = { ...line, automargin: true, showline: true, ticks: "outside", tickcolor: colour("--line") };
@@ -26,7 +28,7 @@ async function runPacked(element) {
       font: { color: colour("--ink"), family: getComputedStyle(document.body).fontFamily, size: 12.5 },
       hoverlabel: { bgcolor: colour("--wash"), bordercolor: colour("--line"), font: { color: colour("--ink") } },
       legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
-      margin: { l: 56, r: 40, t: 12, b: 44 },
+      margin: { l: 56, r: narrow.matches ? 8 : 40, t: 12, b: 44 },  // beside it the mode bar, which phones do not show
       modebar: { bgcolor: "#0000", color: colour("--soft"), activecolor: colour("--ink"), orientation: "v" },
     } };
   }
@@ -42,7 +44,9 @@ async function runPacked(element) {
       });
     }
     const redraw = size => plots.forEach(plot => Plotly.relayout(plot, { template: template(), ...size }));
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => redraw({}));
+    for (const media of [matchMedia("(prefers-color-scheme: dark)"), narrow]) {
+      media.addEventListener("change", () => redraw({}));
+    }
     const paper = document.documentElement.classList;
     addEventListener("beforeprint", () => { paper.add("paper"); redraw({ width: 680 }); });
     addEventListener("afterprint", () => { paper.remove("paper"); redraw({ width: null, autosize: true }); });

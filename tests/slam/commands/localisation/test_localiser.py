@@ -223,7 +223,7 @@ def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, al
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), rows))
     numbers = image_numbers(album, "0:4")
     found = list(localise(album, run, numbers=numbers))
-    truth, known = MapTruth.of(run), true_poses(tmp_path / "truth.txt", album, numbers)
+    truth, known = MapTruth.of(run), true_poses(tmp_path / "truth.txt", album, numbers, reference())
     errors = [truth.error(each, T_true) for each, T_true in zip(found, known, strict=True)]
     whole = localisation_json(found, errors)
     assert isinstance(whole, dict)
@@ -237,6 +237,16 @@ def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, al
     assert len(localisation_table(found, errors).head) == 8
 
 
+def test_the_truth_of_a_run_that_began_later_is_in_its_world(album: Path, tmp_path: Path) -> None:
+    rows, T_any_world = reference()[:5], reference()[30]
+    for T_file_world in (np.eye(4), T_any_world):
+        write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), T_file_world @ rows))
+        of_run = Trajectory(np.arange(3.0), rows[1:4]).rebased().T_world_camera
+        known = true_poses(tmp_path / "truth.txt", album, range(4), of_run)
+        np.testing.assert_allclose(known[1:], of_run, atol=1e-6)
+        np.testing.assert_allclose(known[0], invert(rows[1]) @ rows[0], atol=1e-6)
+
+
 def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="none of 1 images was found"):
         write_localisations(tmp_path / "found.tum", list(localise(album / "50.png", run)))
@@ -246,7 +256,7 @@ def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path:
 def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path, tmp_path: Path) -> None:
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(4.0), reference()[:4]))
     with pytest.raises(RunError, match=r"has 4 poses and .* 5 images"):
-        true_poses(tmp_path / "truth.txt", album, range(5))
+        true_poses(tmp_path / "truth.txt", album, range(5), reference())
     with pytest.raises(SequenceError, match="reaches outside"):
         image_numbers(album, "0:6")
     run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam import run_slam
 from slam.config.sections import load_config
@@ -25,7 +26,6 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam import Slam
 from slam.config.sections import SlamConfig, load_config
@@ -21,7 +22,6 @@ from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.geometry.se3 import apply
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import SlamError
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import SlamConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
@@ -26,7 +27,6 @@ from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.observer import Observer
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.timing import Stopwatch
 from slam.sequences.simulated import SimulatedSequence

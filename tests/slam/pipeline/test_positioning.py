@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
 from slam.frames import Image, Intrinsics
@@ -14,7 +15,6 @@ from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import ConfigError, SlamError
 from slam.sequences.recording import RecordedSequence
 

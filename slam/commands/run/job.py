@@ -15,13 +15,13 @@ from erfsfm.common.signals import Terminated
 from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config.sections import SlamConfig, dump_yaml
 from slam.evaluation.double_walls import double_wall_share
+from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
 from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.submap import remove_submaps
-from slam.mapping.surface import positions
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
@@ -202,7 +202,7 @@ def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
         surface.write_cloud(folder.path / MAP_CLOUD)
     with result.stopwatch.stage("evaluation"):
         share = double_wall_share(surface.meshes()) if result.scale.is_metric else Missing("lengths are not in metres")
-        errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, job.recording)
+        errors = map_errors(lambda: (Ply(piece).points for piece in surface.cloud_pieces()), result, job.recording)
     remove_submaps(folder.path / SUBMAPS)
     job.progress("map files", 1, 1)
     return MapMetrics(**asdict(result.map.statistics()), double_wall_share=share, **dict(errors))

@@ -149,7 +149,7 @@ class SlamPipeline:
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
         scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
-        support = agreement.frame_support(len(drive), drive.motions, drive.map_poses.segments)
+        support = agreement.frame_support(range(len(drive)), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]

@@ -83,7 +83,7 @@ def driven(
     )
     tracker, mask = CornerTrackerState({}), DynamicMask.empty(416, 128, 1.0)
     camera = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
-    by_frame = agreement.frame_support(len(drive), drive.motions, ())
+    by_frame = agreement.frame_support(range(len(drive)), drive.motions, ())
     return agreement.confidence(
         agreement.of_images(drive, camera, by_frame, [pose.ends for pose in poses[:contradicted]], needs_road=True)
     )
@@ -100,5 +100,5 @@ def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtf
 
 def test_a_frame_without_a_motion_has_no_confidence() -> None:
     motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
-    found = agreement.confidence_of_frames(agreement.frame_support(4, motions, {3}))
+    found = agreement.confidence_of_frames(agreement.frame_support(range(4), motions, {3}))
     assert found[0] == found[1] == found[3] > 0.9 > 0.2 > found[2]

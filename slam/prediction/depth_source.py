@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import COUNTED
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
 from slam.runtime.errors import SlamError
 
@@ -72,7 +73,7 @@ class SourcedPredictor:
         """Z-depth ``(H, W)`` at the image's size, NaN where unknown."""
         aligned = self._aligned(frame)
         if np.isnan(aligned.unit):
-            logger.warning("frame %d has no known depth in %s", frame.index, self._source.name)
+            logger.warning("frame %d has no known depth in %s", frame.index, self._source.name, extra=COUNTED)
         return aligned.depth
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:

@@ -19,6 +19,7 @@ from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
 
@@ -62,6 +63,12 @@ class Agreement:
         text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with {self.beside}: {self.figure}"
         logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, "%s", text)
         return self
+
+    def required(self) -> Agreement:
+        """As `said`, of a source that the run has to take; ``SlamError`` where it is wrong."""
+        if self.is_wrong:
+            raise SlamError(f"{self}; check its files and settings, or run without it")
+        return self.said()
 
 
 def of_height(source: str, implied_m: float, stated_m: float | None, spread: float) -> Agreement:

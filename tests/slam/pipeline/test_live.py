@@ -205,6 +205,13 @@ def test_a_number_out_of_its_range_is_refused(option: dict[str, int]) -> None:
         started(load_config(None, SETTINGS), **option)
 
 
+def test_what_predicts_nothing_and_a_height_that_is_no_number_are_refused() -> None:
+    with pytest.raises(SlamError, match=r"predictor must be a Predictor, .*got NoneType"):
+        Slam(None, drive().intrinsics)
+    with pytest.raises(SlamError, match=r"camera_height_m must be metres .*got '1.65'"):
+        Slam(oracle(), drive().intrinsics, camera_height_m="1.65")
+
+
 def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
     class Small(OraclePredictor):
         def depth(self, frame: Frame) -> DepthMap:

@@ -164,8 +164,11 @@ def test_unreadable_scans_are_left_out_and_reported(
         assert "000006.bin is no Velodyne scan" in (folder.path / name).read_text()
     for scan in scans.iterdir():
         scan.write_bytes(b"12345")
-    metrics = check_run(run_slam(**reported | {"dataset": root, "frames": None}).path)
+    again = reported | {"dataset": root, "frames": None}
+    metrics = check_run(run_slam(**again).path)
     assert metrics["trajectories"]["lidar_reason"].startswith("4 of 4 LiDAR scans cannot be read")
+    with pytest.raises(SlamError, match=r"scale\.mode=lidar: 4 of 4 LiDAR scans cannot be read"):
+        run_slam(**again | {"overrides": [*reported.get("overrides", ()), "scale.mode=lidar"]})
 
 
 @pytest.mark.parametrize(

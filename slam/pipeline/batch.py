@@ -190,7 +190,7 @@ class SlamPipeline:
         steps = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
         reason = lidar.reason if isinstance(lidar, MeasurementFailure) else "no two neighbouring scans can be read"
         if self.mode == "lidar" and not steps:
-            raise SlamError(f"scale.mode=lidar: {reason}; restore the scans, or leave the setting out")
+            raise SlamError(f"scale.mode=lidar: {reason}: leave the setting out, or give a sequence with scans")
         if isinstance(lidar, MeasurementFailure):
             logger.warning("%s: the run goes on without LiDAR", reason)
         return steps

@@ -58,7 +58,7 @@ def write_kitti_root(
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
-        raise SequenceError(f"cannot write the simulated sequence to {output}: {error}") from error
+        raise SequenceError(f"cannot write the simulated sequence to {output}: {error.strerror or error}") from error
 
 
 def _write_frames(

@@ -132,12 +132,15 @@ def _run(job: Job, folder: RunFolder) -> None:
     map_metrics = _write_map(folder, result, job)
     depth = quality.metrics(job.settings.depth.refine != "none")
     timing = timing_of(result.stopwatch, len(job.recording) - result.first)
-    folder.write_metrics(metrics.changed(status="ok", reason=None, timing=timing, depth=depth, map=map_metrics))
+    metrics = metrics.changed(timing=timing, depth=depth, map=map_metrics)
+    folder.write_metrics(metrics)
+    metrics = metrics.changed(status="ok", reason=None)
     output = job.settings.output
     job.progress("report", 0, 1)
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
-        write_report(folder, depths.pictures(), _loop_pictures(result, job), views)
+        write_report(folder, depths.pictures(), _loop_pictures(result, job), views, metrics)
+    folder.write_metrics(metrics)
     job.progress("report", 1, 1)
     if job.rerun is not None:
         write_rerun(job.rerun, result, job.recording.intrinsics)

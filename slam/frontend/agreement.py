@@ -61,7 +61,8 @@ class Agreement:
     def said(self) -> Agreement:
         """The same, in the log; as a warning where it is doubtful."""
         text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with {self.beside}: {self.figure}"
-        logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, "%s", text)
+        # as a format: where warnings of a kind are counted, each is of its own
+        logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, text)
         return self
 
     def required(self) -> Agreement:

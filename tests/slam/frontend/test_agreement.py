@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from erfsfm.common.command_line import Terminal
 from slam.frames import RelativePose
 from slam.frontend import agreement
 from slam.frontend.drive import Drive
@@ -96,6 +98,17 @@ def driven(
 )
 def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, float]) -> None:
     assert driven(**doubtful) < 0.5 < 0.9 < driven()
+
+
+def test_two_contradictions_are_two_warnings(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    terminal = Terminal(logging.WARNING)
+    for each in (agreement.Agreement("lidar", 3.0, "50 % off"), agreement.Agreement("GPS", 4.0, "far")):
+        each.said()
+    terminal.count()
+    assert "lidar contradicts" in (said := capsys.readouterr().err) and "GPS contradicts" in said
 
 
 def test_a_frame_without_a_motion_has_no_confidence() -> None:

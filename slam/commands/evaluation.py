@@ -49,18 +49,18 @@ def evaluate(
     files = [Path(path) for path in paths]
     if frames or csv or latex or plot:
         raise typer.BadParameter("--frames, --csv, --latex and --plot need --reference FILE")
-    missing = next((path for path in files if not path.exists()), None)
-    if missing is not None:
-        raise SlamError(f"{missing}: no such file or folder")
     if all(path.is_dir() for path in files):
         if fail_over:
             raise typer.BadParameter("a limit applies to trajectory files: give --reference", param_hint="--fail-over")
         _evaluate_runs(files, as_json)
     elif len(paths) == 2:
+        missing = next((path for path in files if not path.exists()), None)
+        if missing is not None:
+            raise SlamError(f"{missing}: no such file or folder")
         _evaluate_files(files[0], files[1], format, fail_over or [], as_json)
     else:
         given = ", ".join(paths)
-        raise typer.BadParameter(f"give two trajectory files, run folders, or --reference FILE; got {given}")
+        raise typer.BadParameter(f"give two trajectory files, run folders that exist, or --reference FILE; got {given}")
 
 
 @verbs.command()

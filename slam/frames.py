@@ -298,7 +298,8 @@ def runs(frames: Collection[int]) -> list[tuple[int, int]]:
 def nearest(values: NDArray[_Kind], pixels: NDArray[np.floating[Any]]) -> NDArray[_Kind]:
     """Values ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``."""
     u, v = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(values.shape[::-1]) - 1).T
-    return values[v, u]
+    found: NDArray[_Kind] = values[v, u]
+    return found
 
 
 def nearest_depth(depth: DepthMap, pixels: NDArray[np.floating[Any]]) -> FloatArray:

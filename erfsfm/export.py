@@ -86,13 +86,15 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
         seed: of the random images on which both are compared.
 
     Raises:
-        ExportError: another ending, outputs that differ, or another file in the place of the pose network.
+        ExportError: another ending, outputs that differ, or a file in its place that is no such network.
         ConfigError: the paper's dilated depth network, which cannot run.
     """
     if path.suffix != ".onnx":
         raise ExportError(f"--output must end in .onnx; got {path}")
-    if not isinstance(model.pose_net, Absent) and is_foreign(pose_path(path), _MARK):
-        raise ExportError(f"{pose_path(path)} is none of ours and would be replaced: choose another --output")
+    nets = {path: model.depth_net, pose_path(path): model.pose_net}
+    for file in (file for file, net in nets.items() if not isinstance(net, Absent)):
+        if is_foreign(file, _MARK):
+            raise ExportError(f"{file} is none of ours and would be replaced: choose another --output")
     config, generator = model.record.network, torch.Generator().manual_seed(seed)
     files = []
     if not isinstance(model.depth_net, Absent):

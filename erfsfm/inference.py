@@ -22,6 +22,7 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.common.readers.images import resize_image
+from erfsfm.common.readers.pinhole import MOST_PIXELS
 from erfsfm.common.threads import usable_cores
 from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
@@ -211,11 +212,13 @@ class DepthPosePredictor:
             the k-th source in time order.
 
         Raises:
-            ValueError: another number of images than the networks were trained for.
+            ValueError: another number of images than the networks were trained for, or several sizes.
             CheckpointError: the network's output is not finite.
         """
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
+        if len(sizes := {image.shape for image in images if isinstance(image, np.ndarray)}) > 1:
+            raise ValueError(f"images of a snippet must have one size; got {sorted(sizes)}")
         middle = self.sources // 2
         inputs = [self._array(image) for image in images]
         target = inputs.pop(middle)
@@ -246,7 +249,7 @@ class DepthPosePredictor:
 
 
 def require_image(image: object) -> None:
-    """Refuse what is no image ``(H, W, 3)`` uint8.
+    """Refuse what is no image ``(H, W, 3)`` uint8, and more pixels than any camera has.
 
     Raises:
         ValueError: naming what came.
@@ -260,6 +263,8 @@ def require_image(image: object) -> None:
         or not image.size
     ):
         raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {shape} {kind}")
+    if image.size > 3 * MOST_PIXELS:
+        raise ValueError(f"image must have {MOST_PIXELS:,} pixels at most; got {shape}: resize it")
 
 
 def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:

@@ -21,6 +21,7 @@ from erfsfm.common.readers.pinhole import Pinhole
 from slam.geometry.se3 import FloatArray, invert
 
 T = TypeVar("T")
+_Kind = TypeVar("_Kind", bound=np.generic)
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 DepthMap = NDArray[np.float32]
@@ -294,13 +295,17 @@ def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     return found
 
 
+def nearest(values: NDArray[_Kind], pixels: NDArray[np.floating[Any]]) -> NDArray[_Kind]:
+    """Values ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``."""
+    u, v = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(values.shape[::-1]) - 1).T
+    found: NDArray[_Kind] = values[v, u]
+    return found
+
+
 def nearest_depth(depth: DepthMap, pixels: NDArray[np.floating[Any]]) -> FloatArray:
     """Depth ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``, NaN where it is unknown."""
-    height, width = depth.shape
-    u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, width - 1)
-    v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, height - 1)
-    nearest = depth[v, u].astype(np.float64)
-    return np.where(np.isfinite(nearest) & (nearest > 0), nearest, np.nan)
+    found = nearest(depth, pixels).astype(np.float64)
+    return np.where(np.isfinite(found) & (found > 0), found, np.nan)
 
 
 def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32]) -> DepthMap:

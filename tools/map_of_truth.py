@@ -48,7 +48,7 @@ def errors(dataset: Path | None, name: str | None, overrides: list[str]) -> str:
         depth = cv2.resize(sequence.true_depth(frame).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
         image = cv2.resize(sequence.frame(frame).image, size, interpolation=cv2.INTER_AREA)
         tsdf_map.integrate(KeyframeDepth(frame, depth, exact, image, sequence.reference[frame]))
-    found = compare(truth, sequence.reference, {"map": tsdf_map.cloud().points_world})
+    found = compare(truth, sequence.reference, {"map": tsdf_map.cloud().points})
     errors = placed_metrics(PlacedMetrics, found.distances["map"])
     score = written(errors.f_score.m02, 2), written(errors.f_score.m05, 2)
     return (

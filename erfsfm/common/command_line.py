@@ -26,7 +26,6 @@ SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 _LOADING_BYTES = 384 * 2**20  # of NumPy, OpenCV and SciPy: OpenBLAS waits for ever for memory that it cannot have
 # what they would say of a file is said in our own line
 _OPENCV = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
-_MOST_TIMES = 3
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _NOT_UTF8 = "is not in UTF-8: rename it, or set the environment variable LC_ALL to C.UTF-8"
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
@@ -40,26 +39,35 @@ _MEMORY = re.compile(
 
 
 class Terminal(logging.StreamHandler[TextIO]):
-    """Standard error, to which a warning of one kind is said three times, and then how often besides."""
+    """Standard error, to which a warning of one kind is said once, and at the end how often besides.
+
+    One logged with the ``extra`` `COUNTED` is said at the end, with its number.
+    """
 
     def __init__(self, level: int) -> None:
         super().__init__(sys.stderr)
         self.setLevel(level)
         self._times: Counter[str] = Counter()
+        self._held: dict[str, logging.LogRecord] = {}
         logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[self])
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Say a record, unless it was said three times."""
+        """Say a record, unless one like it was said."""
+        kind = f"{record.name}: {record.msg}"
         if record.levelno == logging.WARNING:
-            self._times[f"{record.name}: {record.msg}"] += 1
-        if self._times[f"{record.name}: {record.msg}"] <= _MOST_TIMES:
+            self._times[kind] += 1
+        if hasattr(record, "counted"):
+            self._held.setdefault(kind, record)
+        elif self._times[kind] <= 1:
             super().emit(record)
 
     def count(self) -> None:
         """Say what was not said."""
         for kind, times in self._times.items():
-            if times > _MOST_TIMES:
-                _say(f"WARNING {kind.partition(':')[0]}: {times - _MOST_TIMES} more warnings of this kind")
+            if kind in self._held:
+                _say(self.format(self._held.pop(kind)) + f" ({times} such warnings)" * (times > 1))
+            elif times > 1:
+                _say(f"WARNING {kind.partition(':')[0]}: {times - 1} more warnings of this kind")
         self._times.clear()
 
 

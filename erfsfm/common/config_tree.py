@@ -122,7 +122,7 @@ def _only(section: Any, name: str, known: Collection[str]) -> Any:
 
 
 def _override(tree: dict[str, Any], text: str) -> None:
-    dotted, equals, written = text.partition("=")
+    dotted, equals, written = str(text).partition("=")
     parts = dotted.strip().split(".")
     if not equals or not all(parts):
         raise ConfigError(f"--set needs section.key=value; got '{text}'")

@@ -1,5 +1,6 @@
 """The errors a user can cause; the command line prints them as one line and exits with 1."""
 
+COUNTED = {"counted": True}  # ``extra`` of a warning whose number tells more than each of them
 _LONGEST = 700
 _LAST = 200
 _OF_WORKER = "Original Traceback (most recent call last)"

@@ -52,7 +52,10 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
 
 def is_foreign(path: Path, mark: str) -> bool:
     """Whether something is at ``path`` that is no file with ``mark`` in it, by which a program knows its own."""
-    return path.exists() and not (path.is_file() and mark.encode() in path.read_bytes())
+    try:
+        return mark.encode() not in read_bytes(path, MAX_TEXT_BYTES)
+    except OSError:  # a folder, or a larger file
+        return path.exists()
 
 
 def read_bytes(path: Path, most: int) -> bytes:

@@ -25,31 +25,27 @@ class FolderLock(ExitStack):
         Raises:
             BusyError: another process holds it.
         """
-        try:
-            self._lock(folder, at_once=True)
-        except BlockingIOError as error:
-            raise BusyError(
-                f"another process writes to {folder}: wait for its end, or choose another --output"
-            ) from error
+        if not self._lock(folder, at_once=True):
+            raise BusyError(f"another process writes to {folder}: wait for its end, or choose another --output")
 
     def wait_for(self, folder: Path) -> None:
         """Hold a folder as soon as no other process does; else as `take`."""
         self._lock(folder, at_once=False)
 
-    def _lock(self, folder: Path, at_once: bool) -> None:
+    def _lock(self, folder: Path, at_once: bool) -> bool:
+        """Whether no other process holds it, as far as the file system knows."""
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
         if fcntl is None or not folder.is_dir():
-            return
+            return True
         descriptor = os.open(folder, os.O_RDONLY)
         _held.add(descriptor)
         self.callback(_release, descriptor)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (fcntl.LOCK_NB if at_once else 0))
-        except BlockingIOError:
-            raise
-        except OSError:
-            return
+        except OSError as error:
+            return not isinstance(error, BlockingIOError)
+        return True
 
 
 def _release(descriptor: int) -> None:

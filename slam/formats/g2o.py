@@ -18,6 +18,7 @@ _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UPPER = np.triu_indices(6)
 _VERTEX, _EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 _INDICES = {_VERTEX: 1, _EDGE: 2}
+_UNIT_TOLERANCE = 1e-6
 _NUMBERS = {_VERTEX: 7, _EDGE: 7 + 21}  # a pose, and the upper triangle of the information matrix
 
 
@@ -72,8 +73,9 @@ def check_g2o(path: Path) -> None:
             indices = _INDICES.get(kind)
             if indices is None or len(words) != indices + _NUMBERS[kind]:
                 raise ValueError(f"line {number} is neither a vertex nor an edge")
-            if not np.isfinite(np.array(words[indices:], dtype=np.float64)).all():
-                raise ValueError(f"line {number} has a number that is not finite")
+            numbers = np.array(words[indices:], dtype=np.float64)
+            if not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers[3:7]) - 1) > _UNIT_TOLERANCE:
+                raise ValueError(f"line {number} has a number that is not finite, or no rotation")
             if kind == _VERTEX:
                 vertices += 1
             else:

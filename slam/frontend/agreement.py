@@ -11,13 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.frames import Ends, RelativePose, runs
+from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
+from slam.frontend.segments import named
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +35,7 @@ _FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens 
 USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners over the most of a distance
-_CONTRADICTED_SPREAD, _MOST_NAMED = 0.007, 10
+_CONTRADICTED_SPREAD = 0.007
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
 _SIGMAS, _CONFIDENCE = (1.0, 1.5, 2.0, 3.0, 5.0), (0.97, 0.85, 0.5, 0.2, 0.05)
@@ -59,8 +61,15 @@ class Agreement:
     def said(self) -> Agreement:
         """The same, in the log; as a warning where it is doubtful."""
         text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with {self.beside}: {self.figure}"
-        logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, "%s", text)
+        # as a format: where warnings of a kind are counted, each is of its own
+        logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, text)
         return self
+
+    def required(self) -> Agreement:
+        """As `said`, of a source that the run has to take; ``SlamError`` where it is wrong."""
+        if self.is_wrong:
+            raise SlamError(f"{self}; check its files and settings, or run without it")
+        return self.said()
 
 
 def of_height(source: str, implied_m: float, stated_m: float | None, spread: float) -> Agreement:
@@ -125,7 +134,8 @@ def of_images(
     figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
     found = [("gaps", gaps, figure)]
     if steps:
-        figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}{_ends_of(contradicted)}"
+        figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
+        figure += f", which end at frames {named([last for _, last in contradicted])}" if contradicted else ""
         found.append(("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure))
     if drive.motions or drive.failures or drive.map_poses.segments:  # else nothing was asked of the corners
         figure = f"{100 * mean:.0f} % of the corners fit in the next image"
@@ -144,23 +154,19 @@ def of_images(
         figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"
         sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
         agreements.append(Agreement("the focal length", sigmas, figure))
-    return [each.said() for each in agreements]
+    return [agreements[0], *(each.said() for each in agreements[1:])]  # gaps and segments were said by their frames
 
 
-def _ends_of(steps: Sequence[Ends]) -> str:
-    stretches = runs([last for _, last in steps])
-    named = [f"{first} to {last}" if last > first else str(first) for first, last in stretches[:_MOST_NAMED]]
-    return f", which end at frames {', '.join(named)}{', ...' * (len(stretches) > _MOST_NAMED)}" if named else ""
+def frame_support(frames: range, motions: Iterable[Motion], located: Collection[int]) -> FloatArray:
+    """The support of the motion to each frame ``(N,)``, 0 without one; the first has that of the next.
 
-
-def frame_support(frames: int, motions: Sequence[Motion], located: Collection[int]) -> FloatArray:
-    """The support of the motion to each frame ``(N,)``, 0 without one; frames ``located`` in a map have the usual."""
-    support = np.zeros(frames)
-    support[list(located)] = USUAL_SUPPORT
+    Frames ``located`` in a map have the usual one, as a first frame without a next.
+    """
+    found = dict.fromkeys(located, USUAL_SUPPORT)
     for motion in motions:
-        support[motion.ends[1]] = max(support[motion.ends[1]], motion.support)
-    support[:1] = support[1:2]
-    return support
+        found[motion.ends[1]] = max(found.get(motion.ends[1], 0.0), motion.support)
+    found[0] = found.get(1, 0.0) if len(frames) > 1 else USUAL_SUPPORT
+    return np.array([found.get(frame, 0.0) for frame in frames])
 
 
 def confidence(agreements: Iterable[Agreement]) -> float:

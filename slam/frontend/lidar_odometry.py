@@ -54,7 +54,7 @@ def readable_scan(sequence: Sequence, frame: int) -> FloatArray | str:
 def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | MeasurementFailure | None:
     """Register the scans of a sequence one after the other; None where it has fewer than two.
 
-    Scans that cannot be read are left out, with one warning; a failure where fewer than two can.
+    Scans that cannot be read are left out, with one warning; a failure, without one, where fewer than two can.
     """
     scanned = [k for k in range(len(sequence)) if sequence.has_scan(k)]
     T_camera_lidar = sequence.T_camera_lidar
@@ -81,7 +81,6 @@ def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | M
     if unreadable:
         found = f"{len(unreadable)} of {len(scanned)} LiDAR scans cannot be read, first {min(unreadable.items())[1]}"
         if len(frames) < LEAST_SCANS:
-            logger.warning("%s: the run goes on without LiDAR", found)
             return MeasurementFailure(found)
         logger.warning("%s: they are left out", found)
     T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from slam.frames import Ends, runs
 
+_MOST_NAMED = 10
 _LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
 
 
@@ -49,3 +50,10 @@ def find_segments(count: int, cuts: Collection[int], interpolated: Mapping[int, 
             ends.add(first - 1)
             begins[last + 1] = f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
     return [Segment(first, last, begins[first]) for first, last in zip(sorted(begins), sorted(ends), strict=True)]
+
+
+def named(frames: Collection[int]) -> str:
+    """Stretches of frames in words, the first ten of them."""
+    found = runs(frames)
+    words = [f"{first} to {last}" if last > first else str(first) for first, last in found[:_MOST_NAMED]]
+    return ", ".join(words) + ", ..." * (len(found) > _MOST_NAMED)

@@ -50,13 +50,6 @@ def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return np.asarray((pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1))
 
 
-def are_hidden(pixels: Pixels, hidden: Mask, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Which pixels ``(M, 2)`` of an image ``(H, W)`` a mask ``(h, w)`` of any size hides."""
-    sizes = np.array(hidden.shape[::-1])
-    u, v = np.clip((pixels + 0.5) * (sizes / shape[1::-1]), 0, sizes - 1).astype(np.intp).T
-    return np.asarray(hidden[v, u])
-
-
 def new_corners(
     grey: Grey,
     taken: Pixels,

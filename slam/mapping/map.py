@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
+from slam.formats.ply import Ply
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.fusion import Fusion
 from slam.mapping.submap import BLOCK_VOXELS, Submap, remove_submaps, submap_path, submap_paths
-from slam.mapping.surface import MapSurface, colours, normals, positions
+from slam.mapping.surface import MapSurface
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.run_files import SUBMAPS
@@ -25,29 +26,6 @@ from slam.runtime.run_files import SUBMAPS
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
 _KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
-
-
-@dataclass(frozen=True)
-class MapMesh:
-    """Vertices and unit normals ``(V, 3)`` in the world, triangles ``(T, 3)``, colours ``(V, 3)`` in [0, 1].
-
-    ``filled`` ``(V,)`` marks vertices that close a hole.
-    """
-
-    vertices_world: FloatArray
-    triangles: NDArray[np.int64]
-    normals_world: FloatArray
-    colours: FloatArray
-    filled: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class MapCloud:
-    """Points ``(P, 3)`` and unit normals ``(P, 3)`` in the world, colours ``(P, 3)`` in [0, 1]."""
-
-    points_world: FloatArray
-    normals_world: FloatArray
-    colours: FloatArray
 
 
 @dataclass(frozen=True)
@@ -149,17 +127,15 @@ class TsdfMap:
             self._surface = MapSurface(submap_paths(self._folder), self._config, progress)
         return self._surface
 
-    def mesh(self) -> MapMesh:
-        """The whole surface as triangles, in memory; raises as ``surface``."""
+    def mesh(self) -> Ply:
+        """The whole surface as triangles, in memory, a vertex that closes a hole ``filled``; raises as ``surface``."""
         surface = self.surface()
         vertices = np.concatenate(list(surface.vertex_pieces()))
-        triangles = np.concatenate(list(surface.triangle_pieces()))
-        return MapMesh(positions(vertices), triangles, normals(vertices), colours(vertices), vertices["filled"] > 0)
+        return Ply(vertices, np.concatenate(list(surface.triangle_pieces())))
 
-    def cloud(self) -> MapCloud:
+    def cloud(self) -> Ply:
         """The whole surface as points, in memory; raises as ``surface``."""
-        points = np.concatenate(list(self.surface().cloud_pieces()))
-        return MapCloud(positions(points), normals(points), colours(points))
+        return Ply(np.concatenate(list(self.surface().cloud_pieces())))
 
     @property
     def voxel_size(self) -> float:

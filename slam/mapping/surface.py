@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
-from slam.formats.ply import write_ply_pieces
+from slam.formats.ply import Ply, write_ply_pieces
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
 from slam.mapping.colours import Painter
@@ -60,21 +60,6 @@ class _Kept:
     groups_elsewhere: NDArray[np.int64]
     owned: NDArray[np.int64]
     groups_owned: NDArray[np.int64]
-
-
-def positions(records: NDArray[np.void]) -> FloatArray:
-    """Positions ``(V, 3)`` of vertices."""
-    return np.stack([records[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
-
-
-def normals(records: NDArray[np.void]) -> FloatArray:
-    """Normals ``(V, 3)`` of vertices."""
-    return np.stack([records[name].astype(np.float64) for name in ("nx", "ny", "nz")], axis=1)
-
-
-def colours(records: NDArray[np.void]) -> FloatArray:
-    """Colours ``(V, 3)`` of vertices in [0, 1]."""
-    return np.stack([records[name] for name in ("red", "green", "blue")], axis=1) / 255.0
 
 
 class MapSurface:
@@ -139,7 +124,7 @@ class MapSurface:
     def meshes(self) -> Iterator[tuple[FloatArray, Triangles]]:
         """Vertices ``(V, 3)`` and triangles ``(T, 3)`` of each tile by itself."""
         for piece, kept in zip(self._pieces, self._kept):
-            yield positions(piece.vertices.read()), _kept_triangles(piece, kept)
+            yield Ply(piece.vertices.read()).points, _kept_triangles(piece, kept)
 
     def write_mesh(self, path: Path) -> None:
         """Write the mesh as binary PLY, atomically; ``RunError`` where that fails."""

@@ -145,12 +145,12 @@ class SlamPipeline:
         T_network = chain_raw(drive.snippets, len(drive))
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence, self._progress)
-        steps = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
+        steps = self._lidar_steps(lidar)
         agreements = self._compared(drive, steps, state)
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
         scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
-        support = agreement.frame_support(len(drive), drive.motions, drive.map_poses.segments)
+        support = agreement.frame_support(range(len(drive)), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
@@ -186,20 +186,26 @@ class SlamPipeline:
             support=support,
         )
 
+    def _lidar_steps(self, lidar: LidarPath | MeasurementFailure | None) -> list[RelativePose]:
+        """Steps by LiDAR; ``SlamError`` where there are none and lengths are by LiDAR alone."""
+        steps = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
+        reason = lidar.reason if isinstance(lidar, MeasurementFailure) else "no two neighbouring scans can be read"
+        if self.mode == "lidar" and not steps:
+            raise SlamError(f"scale.mode=lidar: {reason}: leave the setting out, or give a sequence with scans")
+        if isinstance(lidar, MeasurementFailure):
+            logger.warning("%s: the run goes on without LiDAR", reason)
+        return steps
+
     def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:
         """LiDAR and depth from elsewhere beside the images; ``SlamError`` where lengths by LiDAR alone are wrong."""
         by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated)]
-        height = height_by_lidar(steps, drive)
-        if height is not None:
+        if (height := height_by_lidar(steps, drive)) is not None:
             by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self._sequence.camera_height_m, 0.0))
-        found = [max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)]
-        if self._config.depth.source != "network":
-            found.append(agreement.of_depth(self._config.depth.source, state.odometry.depth_error))
-        compared = [each.said() for each in found if each is not None]
-        wrong = [each for each in compared if each.is_wrong and (self.mode == "lidar" or each.source != LIDAR_SOURCE)]
-        if wrong:
-            raise SlamError(f"{wrong[0]}; check its files and settings, or run without it")
-        return compared
+        found = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
+        compared = [] if found is None else [found.required() if self.mode == "lidar" else found.said()]
+        source, error = self._config.depth.source, state.odometry.depth_error
+        by_depth = None if source == "network" else agreement.of_depth(source, error)
+        return compared if by_depth is None else [*compared, by_depth.required()]
 
     def _measure(
         self, drive: Drive, T_network: FloatArray, by_lidar: Sequence[RelativePose], agreements: list[Agreement]
@@ -213,10 +219,8 @@ class SlamPipeline:
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(T_odometry)
             if isinstance(unit, ScaleEstimate) and isinstance(scale.estimate, ScaleEstimate):
-                stated, spread = self._sequence.camera_height_m, scale.estimate.spread
-                agreements.append(agreement.of_height(f"scale.mode={self.mode}", unit.value, stated, spread).said())
-                if agreements[-1].is_wrong:
-                    raise SlamError(f"{agreements[-1]}; give the right lengths, or another scale.mode")
+                name, height, spread = f"scale.mode={self.mode}", self._sequence.camera_height_m, scale.estimate.spread
+                agreements.append(agreement.of_height(name, unit.value, height, spread).required())
             scale = scale.in_metres(unit)
             if isinstance(unit, ScaleEstimate):
                 factors = [factor.scaled(unit.value) for factor in factors]

@@ -7,10 +7,10 @@ import logging
 from slam.frames import runs
 from slam.frontend.drive import DOUBLED, Drive
 from slam.frontend.image_gate import GateState
+from slam.frontend.segments import named
 
 logger = logging.getLogger(__name__)
 
-_MOST_NAMED = 10
 # real drives with automatic exposure have 0.13 at ten frames a second and 0.51 at two
 _ROLLING_EXPOSURE = 0.6
 _LEAST_COMPARED = 30
@@ -19,17 +19,19 @@ _LEAST_STANDING = 0.02  # of the image
 
 def warn_of_doubts(drive: Drive, gate: GateState) -> None:
     """Warn of gaps, of segments, whose places are guesses, and of a frozen end: did the camera stand there?"""
-    gaps = runs(drive.interpolated)
-    for first, last in gaps[:_MOST_NAMED]:
-        logger.warning("frames %d to %d are interpolated: %s", first, last, drive.interpolated[first])
-    if len(gaps) > _MOST_NAMED:
-        more, frames_of_them = gaps[_MOST_NAMED:], sum(last - first + 1 for first, last in gaps[_MOST_NAMED:])
-        logger.warning("%d more stretches are interpolated, of %d frames: see metrics.json", len(more), frames_of_them)
-    _warn_of_segments(drive)
-    doubled = drive.doubled
+    gaps, later, doubled = drive.interpolated, drive.segments[1:], drive.doubled
+    if gaps:
+        more = ", ..." if len(set(gaps.values())) > 1 else ""
+        logger.warning("frames %s are interpolated: %s%s", named(gaps), gaps[min(gaps)], more)
+    if later:
+        begins = named([segment.first for segment in later])
+        logger.warning(
+            "a new segment of the drive begins at frame %s (%s): its place relative to the frames before is a guess",
+            begins,
+            later[0].reason,
+        )
     if doubled:
-        named = ", ".join(map(str, doubled[:_MOST_NAMED])) + (", ..." if len(doubled) > _MOST_NAMED else "")
-        logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named)
+        logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named(doubled))
     if gate.compared >= _LEAST_COMPARED and gate.exposed > _ROLLING_EXPOSURE * gate.compared:
         logger.warning(
             "the exposure rolls: %d of %d images are more than a tenth brighter or darker than the one before; fix the "
@@ -53,19 +55,6 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
                 last,
                 first - 1,
             )
-
-
-def _warn_of_segments(drive: Drive) -> None:
-    """Where a segment begins, its place relative to the ones before is a guess."""
-    later = drive.segments[1:]
-    for segment in later[:_MOST_NAMED]:
-        logger.warning(
-            "a new segment of the drive begins at frame %d (%s): its place relative to the frames before is a guess",
-            segment.first,
-            segment.reason,
-        )
-    if len(later) > _MOST_NAMED:
-        logger.warning("%d more segments begin: see metrics.json", len(later) - _MOST_NAMED)
 
 
 def warn_of_another_place(drive: Drive, first: int) -> None:

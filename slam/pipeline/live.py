@@ -77,6 +77,8 @@ class Slam:
             SlamError: a scale mode that needs more than images, an impossible camera, or a number out of its range.
         """
         self._turns = Turns("Slam")
+        if not hasattr(predictor, "sources"):
+            raise SlamError(f"predictor must be a Predictor, as in Slam.from_weights; got {type(predictor).__name__}")
         _check(intrinsics, camera_height_m, config)
         config = config or SlamConfig()
         if update_frames < 1 or sweep_frames < 0 or not 0 <= seed < 2**31:
@@ -346,5 +348,6 @@ def _check(intrinsics: Intrinsics, camera_height_m: float | None, config: SlamCo
     problem = impossible(intrinsics)
     if problem is not None:
         raise SlamError(f"intrinsics: {problem}")
-    if camera_height_m is not None and not 0 < camera_height_m <= HIGHEST_M:
-        raise SlamError(f"camera_height_m must be metres above the road, to {HIGHEST_M:g}; got {camera_height_m}")
+    is_number = isinstance(camera_height_m, float | int | None)
+    if not is_number or (camera_height_m is not None and not 0 < camera_height_m <= HIGHEST_M):
+        raise SlamError(f"camera_height_m must be metres above the road, to {HIGHEST_M:g}; got {camera_height_m!r}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
-from slam.frontend.agreement import USUAL_SUPPORT, confidence_of_frames
+from slam.frontend.agreement import confidence_of_frames, frame_support
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.network_factors import chain_raw
@@ -18,6 +18,7 @@ from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.geometry.se3 import FloatArray, invert
 from slam.pipeline.observer import Observer
 
+_LAST_STEPS = 4  # looked through for that to a frame
 State = Literal["starting", "tracking", "bridged", "relocalised"]
 
 
@@ -89,13 +90,15 @@ class LivePoses:
         """The frames that the observer has finished since the last call."""
         drive = observer.drive
         first, count = len(self._T_world_camera), len(drive)
-        support = np.array([self._step(observer, index) for index in range(first, count)])
+        frames = range(first, count)
+        located = [index for index in frames if self._step(observer, index)]
         if drive.snippets and (self._unit is None or count // self._update > first // self._update):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
+        support = frame_support(frames, drive.motions[-_LAST_STEPS * len(frames) :], located)
         return [
             LivePose(k, self._T_world_camera[k].copy(), self._state(k in drive.unusable), unit, confidence)
-            for k, confidence in enumerate(confidence_of_frames(support).tolist(), first)
+            for k, confidence in zip(frames, confidence_of_frames(support).tolist())
         ]
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
@@ -112,13 +115,14 @@ class LivePoses:
             return "starting"
         return "bridged" if is_bridged else "relocalised" if before else "tracking"
 
-    def _step(self, observer: Observer, index: int) -> float:
-        """Append the pose of a frame by its own step, or by the last one again; its support is returned."""
+    def _step(self, observer: Observer, index: int) -> bool:
+        """Append the pose of a frame by its own step, or by the last one again; whether a map has it."""
         if not index:
             self._T_world_camera.append(np.eye(4))
-            return USUAL_SUPPORT
+            return False
         before, by_keyframes = index - 1, observer.keyframe_step(index)
-        motion = next((m for m in reversed(observer.drive.motions[-4:]) if m.ends == (before, index)), None)
+        motions = observer.drive.motions[-_LAST_STEPS:]
+        motion = next((m for m in reversed(motions) if m.ends == (before, index)), None)
         T_before_frame = self._T_previous_newest
         if by_keyframes is not None:
             before, T_before_frame = by_keyframes
@@ -129,7 +133,7 @@ class LivePoses:
             T_before_frame[:3, 3] *= self.unit
         self._T_world_camera.append(self._T_world_camera[before] @ T_before_frame)
         self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
-        return USUAL_SUPPORT if by_keyframes is not None else 0.0 if motion is None else motion.support
+        return by_keyframes is not None
 
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""

@@ -52,12 +52,10 @@ class Positioning:
     def locate(
         self, T_world_camera: FloatArray, scale: ScaleEstimate | MeasurementFailure
     ) -> Location | MeasurementFailure:
-        """Where a trajectory ``(N, 4, 4)`` lies on the earth; a failure, be it that of its scale, is logged."""
-        T_enu_world: FloatArray | MeasurementFailure
+        """Where a trajectory ``(N, 4, 4)`` lies on the earth; a failure is logged, as that of its scale was."""
         if isinstance(scale, MeasurementFailure):
-            T_enu_world = scale
-        else:
-            T_enu_world = gps.align(self._fixes, T_world_camera, self._stamps)
+            return scale
+        T_enu_world: FloatArray | MeasurementFailure = gps.align(self._fixes, T_world_camera, self._stamps)
         if not isinstance(T_enu_world, MeasurementFailure):
             T_enu_world = self._agreeing(T_enu_world, T_world_camera)
         if isinstance(T_enu_world, MeasurementFailure):

@@ -1,1 +1,1 @@
-"""Predictors of depth and snippet poses: the networks, optionally cached, and an oracle for tests."""
+"""Predictors of depth and snippet poses: the networks, optionally cached, and depth from elsewhere."""

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import COUNTED
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
 from slam.runtime.errors import SlamError
 
@@ -62,6 +63,7 @@ class SourcedPredictor:
         self._source = source
         self._align = align
         self._key = object()
+        self._is_known, self._unknown = False, list[int]()  # depth of a frame so far, and of which it is not
         self.sources = networks.sources
 
     def executor(self) -> Executor:
@@ -71,8 +73,10 @@ class SourcedPredictor:
     def depth(self, frame: Frame) -> DepthMap:
         """Z-depth ``(H, W)`` at the image's size, NaN where unknown."""
         aligned = self._aligned(frame)
-        if np.isnan(aligned.unit):
-            logger.warning("frame %d has no known depth in %s", frame.index, self._source.name)
+        self._unknown += [frame.index] if np.isnan(aligned.unit) else []
+        self._is_known |= not np.isnan(aligned.unit)
+        while self._is_known and self._unknown:  # else `snippet` refuses all of them
+            logger.warning("frame %d has no known depth in %s", self._unknown.pop(0), self._source.name, extra=COUNTED)
         return aligned.depth
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:

@@ -21,6 +21,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state as state
 from erfsfm.common.files import read_bytes
 from erfsfm.common.onnx_session import open_session, run_limited
 from erfsfm.common.readers.images import resize_image
+from erfsfm.common.readers.pinhole import MOST_PIXELS
 from erfsfm.inference import NETWORK_THREADS
 from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
@@ -100,10 +101,10 @@ class OnnxDepth:
             ) from error
         found = np.asarray(output)
         sides = [side for side in found.shape if side != 1]
-        if len(sides) != 2 or found.dtype.kind != "f":
+        if len(sides) != 2 or found.dtype.kind != "f" or found.size > MOST_PIXELS:
             raise SlamError(
-                f"output {self._output} of {self._path} must be floats of one map (1, 1, H, W); got {found.dtype} "
-                f"{found.shape}: choose another with depth.output_name"
+                f"output {self._output} of {self._path} must be floats of one map (1, 1, H, W) of at most "
+                f"{MOST_PIXELS:,} pixels; got {found.dtype} {found.shape}: choose another with depth.output_name"
             )
         return np.asarray(found.reshape(sides), dtype=np.float32)
 

@@ -58,7 +58,7 @@ def estimate_metrics(
     return Metrics(
         schema_=1,
         status="estimated",
-        reason="the run has not ended, or was killed while it made the map",
+        reason="the run has not ended, or was killed while it made the map or the report",
         provenance=provenance,
         sequence=_sequence(result, sequence),
         timing=timing_of(result.stopwatch, len(sequence) - result.first),

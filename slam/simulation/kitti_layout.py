@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.formats.ply import Ply, write_ply
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Float32Array, FloatArray
 from slam.simulation.options import VERSION
@@ -50,12 +51,14 @@ def write_kitti_root(
             _write_frames(world, partial / "sequences" / "sim", depth, lidar, progress)
             _write_records(world, partial)
             if mesh:
-                write_mesh(partial / "mesh.ply", *world.mesh_world())
+                vertices, triangles = world.mesh_world()
+                corners = np.ascontiguousarray(vertices, "<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
+                write_ply(partial / "mesh.ply", Ply(corners, triangles.astype(np.int64)))
             partial.replace(output)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
-        raise SequenceError(f"cannot write the simulated sequence to {output}: {error}") from error
+        raise SequenceError(f"cannot write the simulated sequence to {output}: {error.strerror or error}") from error
 
 
 def _write_frames(
@@ -105,16 +108,6 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
 def write_depth(path: Path, depth: Float32Array) -> None:
     """A depth map in metres ``(H, W)`` as 16-bit PNG, metres x 256."""
     _write_png(path, np.clip(np.rint(depth * 256.0), 0.0, 65535.0).astype(np.uint16))
-
-
-def write_mesh(path: Path, vertices: Float32Array, triangles: NDArray[np.uint32]) -> None:
-    """Vertices ``(V, 3)`` and triangles ``(T, 3)`` as binary PLY."""
-    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, triangles
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {axis}" for axis in "xyz"]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
-    path.write_bytes("\n".join(header).encode() + vertices.astype("<f4").tobytes() + faces.tobytes())
 
 
 def write_calibration(path: Path, K: FloatArray, T_camera_lidar: FloatArray | None) -> None:

@@ -244,6 +244,14 @@ def test_another_number_of_images_is_refused(predictor: DepthPosePredictor, coun
         predictor.poses([image() for _ in range(count)])
 
 
+def test_images_of_several_sizes_and_of_a_billion_pixels_are_refused(predictor: DepthPosePredictor) -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    with pytest.raises(ValueError, match="must have one size"):
+        predictor.poses([image, image, image, image, image[:4]])
+    with pytest.raises(ValueError, match="67,108,864 pixels at most"):
+        predictor.depth(np.broadcast_to(image[:1, :1], (40000, 40000, 3)))
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_without_a_gpu_cuda_is_refused() -> None:
     with pytest.raises(ConfigError, match="use cpu"):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam import run_slam
 from slam.config.sections import load_config
@@ -25,7 +26,6 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
@@ -98,7 +98,7 @@ def test_the_camera_height_gives_metres(round_trip: Estimate) -> None:
 @pytest.mark.slow
 def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> None:
     assert round_trip.map is not None and round_trip.reference is not None
-    points = round_trip.map.cloud().points_world[::7]
+    points = round_trip.map.cloud().points[::7]
     assert len(points) > 10_000
     fit = pose_similarity(round_trip.reference.T_world_camera, round_trip.optimised.T_world_camera)
     points = fit.scale * points @ fit.R_a_b.T + fit.t_a_b
@@ -113,7 +113,7 @@ def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> Non
     exact = ["visual_odometry.enabled=false", "depth.refine=none"]  # true depth is the better one
     result = SlamPipeline(part, oracle, load_config(None, exact)).run()
     assert result.map is not None
-    points = se3.apply(street.street.T_world_camera[40], result.map.cloud().points_world)
+    points = se3.apply(street.street.T_world_camera[40], result.map.cloud().points)
     assert np.median(street.street.distance_to_surface(points)) < 0.03
 
 

@@ -43,9 +43,8 @@ def batch(
     """
     from slam.commands.batch.cluster import workers as dask_workers
     from slam.commands.batch.execution import Limits, run_drives
-    from slam.commands.batch.manifest import drives_of
+    from slam.commands.batch.manifest import drives_of, require_known
     from slam.commands.batch.summary import CSV, PAGE, check_output, summary_table, write_summary
-    from slam.config.sections import load_config
 
     if memory and not Path("/proc/self/statm").exists():
         raise SlamError("--memory needs Linux: leave it out here")
@@ -56,8 +55,9 @@ def batch(
         options += ["--config", from_anywhere(config) if Path(config).is_file() else config]
     options += ["--frames", frames] if frames is not None else []
     options += ["--seed", str(seed), "--device", device]
-    load_config(config, overrides or ())  # what is wrong for every drive is said once, before anything is written
     planned = drives_of(drives, sequence or ["all"], options)
+    for drive in planned:
+        require_known(drive)
     each = threads or (0 if scheduler else max((os.cpu_count() or 1) // workers, 1))
     check_output(output, planned)
     output.mkdir(parents=True, exist_ok=True)

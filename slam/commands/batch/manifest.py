@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 import shlex
 from collections.abc import Iterable, Sequence
@@ -11,9 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.files import read_text
+from erfsfm.common.readers.frame_range import EVERYTHING
 from erfsfm.common.yaml_file import read_yaml
+from erfsfm.inference import record_of_whole_weights
+from slam.config.sections import load_config
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import sequence_names
+from slam.sequences.excerpt import frame_range
 
 MANIFESTS = (".yaml", ".yml", ".csv")
 _KEYS = ("name", "dataset", "sequence", "camera", "options")
@@ -68,7 +74,7 @@ def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
     try:
         rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _yaml_rows(path)
     except (ErfsfmError, OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SequenceError(f"the manifest {path} cannot be read: {error}") from error
+        raise SequenceError(f"the manifest {path} cannot be read: {getattr(error, 'strerror', error)}") from error
     if not rows:
         raise SequenceError(f"{path} names no drive: give a list of {', '.join(_KEYS)}")
     return _named(
@@ -81,8 +87,8 @@ def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
 
 
 def _csv_rows(path: Path) -> list[dict[str, Any]]:
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        return [{key: word for key, word in row.items() if word} for row in csv.DictReader(file, skipinitialspace=True)]
+    lines = io.StringIO(read_text(path), newline="")
+    return [{key: word for key, word in row.items() if word} for row in csv.DictReader(lines, skipinitialspace=True)]
 
 
 def _yaml_rows(path: Path) -> list[dict[str, Any]]:
@@ -113,6 +119,27 @@ def _drive(row: dict[str, Any], path: Path, where: str, options: Sequence[str]) 
     named = [word for key in ("dataset", "sequence", "camera") if key in row for word in (f"--{key}", str(row[key]))]
     name = str(row.get("name") or row.get("sequence") or Path(row["dataset"]).stem)
     return Drive(name, path.absolute().parent, (*named, *options, *own))
+
+
+def require_known(drive: Drive) -> None:
+    """Check what can be wrong in the options of a drive whatever its recording holds.
+
+    Raises:
+        SlamError, ErfsfmError: one line.
+    """
+    given: dict[str, list[str]] = {}
+    for word, following in zip(drive.arguments, (*drive.arguments[1:], "")):
+        option, equals, value = word.partition("=")
+        given.setdefault(option, []).append(value if equals else following)
+
+    def last(option: str, default: str | None = None) -> str | None:
+        value = given.get(option, [default])[-1]
+        return str(drive.folder / value) if value and (drive.folder / value).exists() else value
+
+    load_config(last("--config"), given.get("--set", ()))
+    if (frames := last("--frames")) is not None:
+        frame_range(frames, EVERYTHING)
+    record_of_whole_weights(last("--weights", "default") or "")
 
 
 def _named(drives: Iterable[tuple[str, Drive]], path: Path) -> list[Drive]:

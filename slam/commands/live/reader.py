@@ -13,6 +13,7 @@ from slam.runtime.errors import SequenceError
 
 INTERRUPTED, OVER = "it was interrupted", "the source ended"
 EXPECTED = (INTERRUPTED, OVER)
+_LAST_IMAGE_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class Reader:
         self._newest: Arrival | None = None
         self._reason: str | None = None
         self._changed, self._stopped = Condition(), Event()
-        Thread(target=self._read, name="reader", daemon=True).start()
+        self._thread = Thread(target=self._read, name="reader", daemon=True)
+        self._thread.start()
 
     def __iter__(self) -> Iterator[Arrival]:
         while (arrival := self._take()) is not None:
@@ -64,6 +66,11 @@ class Reader:
         """End after the image that waits."""
         self._stopped.set()
         self._end(INTERRUPTED)
+
+    def close(self) -> None:
+        """Stop, and wait for the thread: one that still decodes an image when the process ends would abort it."""
+        self.stop()
+        self._thread.join(_LAST_IMAGE_S)
 
     def _take(self) -> Arrival | None:
         with self._changed:

@@ -147,10 +147,13 @@ class _Session:
 
 @contextmanager
 def _stopping(sequence: StreamedSequence) -> Iterator[None]:
-    """The first ctrl-C, SIGTERM or SIGHUP ends the stream, a second ctrl-C the run."""
+    """The first ctrl-C, SIGTERM or SIGHUP ends the stream, a second ctrl-C the run; its reader ends with the block."""
 
     def stop(*_: object) -> None:
         Thread(target=sequence.reader.stop).start()  # its lock may be held by the code that was interrupted
 
-    with calling_on_signals(stop):
-        yield
+    try:
+        with calling_on_signals(stop):
+            yield
+    finally:
+        sequence.reader.close()

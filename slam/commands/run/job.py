@@ -15,13 +15,13 @@ from erfsfm.common.signals import Terminated
 from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config.sections import SlamConfig, dump_yaml
 from slam.evaluation.double_walls import double_wall_share
+from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
 from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.submap import remove_submaps
-from slam.mapping.surface import positions
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
@@ -132,12 +132,15 @@ def _run(job: Job, folder: RunFolder) -> None:
     map_metrics = _write_map(folder, result, job)
     depth = quality.metrics(job.settings.depth.refine != "none")
     timing = timing_of(result.stopwatch, len(job.recording) - result.first)
-    folder.write_metrics(metrics.changed(status="ok", reason=None, timing=timing, depth=depth, map=map_metrics))
+    metrics = metrics.changed(timing=timing, depth=depth, map=map_metrics)
+    folder.write_metrics(metrics)
+    metrics = metrics.changed(status="ok", reason=None)
     output = job.settings.output
     job.progress("report", 0, 1)
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
-        write_report(folder, depths.pictures(), _loop_pictures(result, job), views)
+        write_report(folder, depths.pictures(), _loop_pictures(result, job), views, metrics)
+    folder.write_metrics(metrics)
     job.progress("report", 1, 1)
     if job.rerun is not None:
         write_rerun(job.rerun, result, job.recording.intrinsics)
@@ -202,7 +205,7 @@ def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
         surface.write_cloud(folder.path / MAP_CLOUD)
     with result.stopwatch.stage("evaluation"):
         share = double_wall_share(surface.meshes()) if result.scale.is_metric else Missing("lengths are not in metres")
-        errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, job.recording)
+        errors = map_errors(lambda: (Ply(piece).points for piece in surface.cloud_pieces()), result, job.recording)
     remove_submaps(folder.path / SUBMAPS)
     job.progress("map files", 1, 1)
     return MapMetrics(**asdict(result.map.statistics()), double_wall_share=share, **dict(errors))

@@ -130,9 +130,6 @@ def find_scale(
         logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
     if named == "camera heights" and _frames_with_road(by_planes, used) < _LEAST_ROAD * frames:
         named = "no metric unit"
-    if mode == "lidar" and not is_metric:
-        estimate = MeasurementFailure("no step was measured by LiDAR, and the height of the camera is unknown")
-        logger.warning("no metres (%s): lengths stay in %s", estimate.reason, named)
     contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
     return Scale(mode, estimate, per_frame, _measured_lengths(steps, solved), named, contradicted)
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frames import Frame, Grey, Mask
-from slam.frontend.sparse_flow import Pixels, are_hidden, are_inside, lucas_kanade, new_corners
+from slam.frames import Frame, Grey, Mask, nearest, resized_mask
+from slam.frontend.sparse_flow import Pixels, are_inside, lucas_kanade, new_corners
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.geometry.se3 import FloatArray
 
@@ -90,7 +90,7 @@ class CornerTracker:
             corners = self._filled(previous, _no_corners(), standing)
         forward, kept = self._tracked(previous, current, corners.pixels, predicted_flow)
         if standing is not None:
-            kept &= ~are_hidden(forward, standing, current.grey.shape)
+            kept &= ~nearest(resized_mask(standing, *current.grey.shape[::-1]), forward)
         track_ids = corners.track_ids[kept]
         if current.index not in self._state.corners:
             self._filled(current, Corners(forward[kept], track_ids), standing)

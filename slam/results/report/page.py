@@ -39,19 +39,21 @@ def write_report(
     depths: Sequence[Picture] = (),
     loops: Sequence[Picture] = (),
     views: MapViews | None = None,
+    metrics: Metrics | None = None,
 ) -> None:
     """Write ``report.html`` from the files of a folder; also for a failed run.
 
     Args:
-        folder: the run, with its ``metrics.json`` and trajectories written.
+        folder: the run, with its trajectories written.
         depths: strips of images and their depth.
         loops: pairs of images of accepted loops.
         views: of the map, or None without one.
+        metrics: of the run; None reads ``metrics.json``.
 
     Raises:
         RunError: ``metrics.json`` is damaged.
     """
-    metrics, loops_file = folder.metrics(), _loops_file(folder)
+    metrics, loops_file = metrics or folder.metrics(), _loops_file(folder)
     page = render(
         "page.html.j2",
         name=known(metrics.sequence.name) or folder.path.resolve().name,

@@ -81,6 +81,5 @@ def _log_map(rr: Any, stream: Any, result: Estimate) -> None:
         cloud = result.map.cloud()
     except EmptyMapError:  # an empty map, which the run has reported
         return
-    colours = np.round(255 * np.clip(cloud.colours, 0, 1)).astype(np.uint8)
-    points = rr.Points3D(cloud.points_world, colors=colours, radii=_POINT_VOXELS * result.map.voxel_size)
+    points = rr.Points3D(cloud.points, colors=cloud.colours, radii=_POINT_VOXELS * result.map.voxel_size)
     stream.log("world/map", points, static=True)

@@ -16,7 +16,7 @@ _FROM = {
     "known": "a known distance",
     "reference": "the truth itself, so that it is no result",
 }
-_WIDE_SPREAD, _FEW = 0.15, 0.5  # of the scale; frames that measured it over all
+_WIDE_SPREAD = 0.15  # of the scale
 _LARGEST_SCALE_ERROR = 0.03
 _SURE = 0.5
 _NOISE_POINTS = 0.12  # share of factors off the promised one
@@ -68,13 +68,10 @@ def _no(unit: str) -> str:
 
 
 def _unit(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    scale, frames = metrics.scale, known(metrics.sequence.frames)
-    spread, used = known(scale.spread), known(scale.frames_used)
+    scale, spread = metrics.scale, known(metrics.scale.spread)
     if metrics.unit == METRES and (source := _FROM.get(known(scale.mode) or "")):
         certain = f" (spread {percent(spread)})" if spread is not None else ""
         yield scale.mode != "reference" and (spread or 0.0) < _WIDE_SPREAD, f"metres come from {source}{certain}"
-    if scale.mode in ("camera-height", "none") and used and frames and used < _FEW * frames:
-        yield False, f"only {used} of {frames} frames see a road"
     fitted = known(metrics.trajectories.optimised.align.dof7.scale)
     if metrics.is_metric and fitted and abs(fitted - 1.0) > _LARGEST_SCALE_ERROR:
         yield False, f"lengths are {percent(abs(1.0 / fitted - 1.0))} too {'short' if fitted > 1.0 else 'long'}"

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import COUNTED
 from slam.runtime.errors import SlamError
 from slam.runtime.storage.files import write_atomically
 
@@ -75,11 +76,11 @@ class DiskCache:
         except FileNotFoundError:
             return None
         except OSError as error:
-            logger.warning("cache entry %s cannot be read (%s): computed again", path, error.strerror)
+            logger.warning("cache entry %s cannot be read (%s): computed again", path, error.strerror, extra=COUNTED)
             return None
         check, content = raw[:_CHECK_BYTES], raw[_CHECK_BYTES:]
         if _checksum(content) != check:
-            logger.warning("cache entry %s is damaged: computed again", path)
+            logger.warning("cache entry %s is damaged: computed again", path, extra=COUNTED)
             return None
         return _unpacked(content)
 

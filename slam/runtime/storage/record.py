@@ -113,7 +113,8 @@ class Record(BaseModel):
         except RecursionError as error:
             raise RunError(f"{path} is damaged: nested without end; run the sequence again") from error
         except (OSError, ValueError) as error:
-            raise RunError(f"{path} is damaged: {' '.join(str(error).split())}; run the sequence again") from error
+            reason = " ".join(str(getattr(error, "strerror", None) or error).split())
+            raise RunError(f"{path} is damaged: {reason}; run the sequence again") from error
 
     def __getitem__(self, key: str) -> Any:
         """The value of a key as JSON has it, so that a record reads like the file."""

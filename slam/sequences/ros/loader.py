@@ -225,6 +225,10 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     """The cameras of a bag by topic; those of a folder of bags by bag, and by topic where a bag has several."""
     if is_bag(path):
         topics = camera_topics(path)
+        if not topics:
+            with closing(Bag(path)) as bag:
+                held = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.types.items())) or "nothing"
+            raise SequenceError(f"bag {path} has no topic with images of a camera: it holds {held}")
         return {topic: _opener(path, topic, len(topics) > 1, asked) for topic in topics}
     found = {}
     for file in sorted(path.glob("*.bag")) if path.is_dir() else ():

@@ -30,12 +30,13 @@ def outcome(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 
 def test_a_warning_that_repeats_is_counted() -> None:
-    program = "import logging\nfrom erfsfm.common import command_line\n"
-    program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('cache').warning('entry %d', k)\n"
+    program = "import logging\nfrom erfsfm.common import command_line, errors\n"
+    program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('images').warning('image %d', k)\n"
+    program += " for k in range(9): logging.getLogger('cache').warning('entry %d', k, extra=errors.COUNTED)\n"
     program += " raise OSError('the error')\ncommand_line.run(app, 'program', logging.WARNING)"
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False).stderr
-    last = ["WARNING cache: entry 2", "WARNING cache: 108 more warnings of this kind", "program: the error"]
-    assert said.splitlines()[2:] == last
+    last = ["WARNING cache: entry 0 (9 such warnings)", "program: the error"]
+    assert said.splitlines() == ["WARNING images: image 0", "WARNING images: 110 more warnings of this kind", *last]
 
 
 @pytest.mark.parametrize("words", [("--output", ""), ("--output=",)])

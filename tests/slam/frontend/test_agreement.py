@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from erfsfm.common.command_line import Terminal
 from slam.frames import RelativePose
 from slam.frontend import agreement
 from slam.frontend.drive import Drive
@@ -83,7 +85,7 @@ def driven(
     )
     tracker, mask = CornerTrackerState({}), DynamicMask.empty(416, 128, 1.0)
     camera = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
-    by_frame = agreement.frame_support(len(drive), drive.motions, ())
+    by_frame = agreement.frame_support(range(len(drive)), drive.motions, ())
     return agreement.confidence(
         agreement.of_images(drive, camera, by_frame, [pose.ends for pose in poses[:contradicted]], needs_road=True)
     )
@@ -98,7 +100,18 @@ def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtf
     assert driven(**doubtful) < 0.5 < 0.9 < driven()
 
 
+def test_two_contradictions_are_two_warnings(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    terminal = Terminal(logging.WARNING)
+    for each in (agreement.Agreement("lidar", 3.0, "50 % off"), agreement.Agreement("GPS", 4.0, "far")):
+        each.said()
+    terminal.count()
+    assert "lidar contradicts" in (said := capsys.readouterr().err) and "GPS contradicts" in said
+
+
 def test_a_frame_without_a_motion_has_no_confidence() -> None:
     motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
-    found = agreement.confidence_of_frames(agreement.frame_support(4, motions, {3}))
+    found = agreement.confidence_of_frames(agreement.frame_support(range(4), motions, {3}))
     assert found[0] == found[1] == found[3] > 0.9 > 0.2 > found[2]

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import LoopsConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
@@ -17,7 +18,6 @@ from slam.loops.descriptors import FeatureExtractor
 from slam.loops.verification import Loop
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

@@ -19,10 +19,10 @@ def test_submaps_merge_to_the_surface_of_one(street_map):
     assert many.statistics().frames_fused == 18 and many.statistics().frames_left_out == 0
     a, b = one.mesh(), many.mesh()
     assert abs(len(a.triangles) - len(b.triangles)) < 0.01 * len(a.triangles)
-    low, high = a.vertices_world.min(axis=0), a.vertices_world.max(axis=0)
-    np.testing.assert_allclose([b.vertices_world.min(axis=0), b.vertices_world.max(axis=0)], [low, high], atol=0.01)
-    distance = np.minimum(np.abs(b.vertices_world[:, 1] - 1.65), np.abs(np.abs(b.vertices_world[:, 0]) - 6))
-    distance = np.minimum(distance, np.abs(b.vertices_world[:, 2] - 40))
+    low, high = a.points.min(axis=0), a.points.max(axis=0)
+    np.testing.assert_allclose([b.points.min(axis=0), b.points.max(axis=0)], [low, high], atol=0.01)
+    distance = np.minimum(np.abs(b.points[:, 1] - 1.65), np.abs(np.abs(b.points[:, 0]) - 6))
+    distance = np.minimum(distance, np.abs(b.points[:, 2] - 40))
     assert np.median(distance) < 0.01
 
 
@@ -35,7 +35,7 @@ def test_tiles_are_joined_without_a_seam(street_map):
     """The road crosses the border of tiles at x = 0; with voxels of 0.1 m another one lies at z = 25.6."""
     # a wall without noise that was seen once lies on voxels exactly, whose vertices coincide
     mesh = street_map(voxel_size_m=0.1, min_component_triangles=0, min_weight=2.0).mesh()
-    vertices, triangles = mesh.vertices_world, mesh.triangles
+    vertices, triangles = mesh.points, mesh.triangles
     assert len(np.unique(vertices, axis=0)) == len(vertices)
     edges = Counter(map(tuple, np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).tolist()))
     assert max(edges.values()) == 2

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from erfsfm.common.progress import Progress, silent
 from erfsfm.inference import DepthPosePredictor
@@ -25,7 +26,6 @@ from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.prediction.networks import NetworkPredictor
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence

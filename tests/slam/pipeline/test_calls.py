@@ -9,13 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
 from slam.loops.descriptors import FeatureExtractor
 from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.fusion import Fusion
 from slam.pipeline.batch import SlamPipeline
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

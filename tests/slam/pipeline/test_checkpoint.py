@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from erfsfm.model_record import find_weights
 from erfsfm.pose_noise import file_sha256
 from slam import Slam, run_slam
 from slam.config.sections import load_config
 from slam.frames import Frame
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError, SlamError

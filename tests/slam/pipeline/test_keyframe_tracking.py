@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oracle import OraclePredictor
 
 from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
@@ -17,7 +18,6 @@ from slam.pipeline.checkpoint import SERIALISER
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
 from slam.pipeline.observer import Observer
-from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "keyframes" / "room.py")

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam import Slam
 from slam.config.sections import SlamConfig, load_config
@@ -21,7 +22,6 @@ from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.geometry.se3 import apply
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import SlamError
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
@@ -208,6 +208,13 @@ def test_an_impossible_camera_is_refused(key: str, value: float) -> None:
 def test_a_number_out_of_its_range_is_refused(option: dict[str, int]) -> None:
     with pytest.raises(SlamError, match="wanted update_frames >= 1"):
         started(load_config(None, SETTINGS), **option)
+
+
+def test_what_predicts_nothing_and_a_height_that_is_no_number_are_refused() -> None:
+    with pytest.raises(SlamError, match=r"predictor must be a Predictor, .*got NoneType"):
+        Slam(None, drive().intrinsics)
+    with pytest.raises(SlamError, match=r"camera_height_m must be metres .*got '1.65'"):
+        Slam(oracle(), drive().intrinsics, camera_height_m="1.65")
 
 
 def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:

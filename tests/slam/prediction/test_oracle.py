@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from oracle import OracleNoise, OraclePredictor
 
 from slam.frames import Frame, Predictor
 from slam.geometry import se3
-from slam.prediction.oracle import OracleNoise, OraclePredictor
 
 IMAGE = np.zeros((40, 60, 3), np.uint8)
 

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,8 +21,10 @@ from slam.commands.batch.cluster import workers
 from slam.commands.batch.execution import Limits, run_drive, run_drives
 from slam.commands.batch.manifest import Drive, drives_of
 from slam.commands.batch.summary import check_output, write_summary
+from slam.commands.cli import main
 from slam.runtime.errors import RunError, SequenceError, SlamError
 
+CommandLine = Callable[..., tuple[int, str, str]]
 QUICK = ["--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false"]
 
 UNITS_WITHOUT_METRES = ("camera heights", "the networks' own unit")
@@ -65,6 +68,24 @@ def test_a_manifest_that_is_not_understood(tmp_path: Path, text: str, said: str)
     path.write_text(text)
     with pytest.raises(SequenceError, match=said):
         drives_of(path, ["all"], [])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--set mapping.voxel_size_m=-1", "greater than or equal to 0.001"),
+        ("--set=scale.mode=best", "got 'best'"),
+        ("--weights none", "no weights 'none'"),
+        ("--frames 5", "is not a range"),
+    ],
+)
+def test_wrong_options_of_one_drive_are_refused_before_anything_is_written(
+    tmp_path: Path, command_line: CommandLine, words: str, said: str
+) -> None:
+    manifest, output = tmp_path / "drives.yaml", tmp_path / "out"
+    manifest.write_text(f"- {{dataset: a}}\n- {{dataset: b, options: '{words}'}}\n")
+    code, _, err = command_line(main, "erfsfm-slam", "batch", manifest, "--output", output)
+    assert code == 1 and said in err and err.count("\n") == 1 and not output.exists()
 
 
 def test_sequences_of_a_data_set(kitti_root: Path) -> None:

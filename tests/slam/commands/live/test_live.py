@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -399,6 +400,14 @@ def test_a_broken_first_image_is_left_out(street: Path, tmp_path: Path) -> None:
     for stamp, image in source.images(stopped):
         assert (stamp, image.shape) == (0.1, (source.height, source.width, 3))
         stopped.set()
+
+
+def test_the_reader_ends_with_a_run_that_cannot_begin(street: Path, tiny_weights: Path) -> None:
+    """A thread that decodes an image while the process ends aborts it."""
+    request = request_of(str(street / "images"), tiny_weights, SETTINGS, Path("/proc/live"), wait=0.5)
+    with pytest.raises(SlamError, match="no run folder can be made in /proc/live"):
+        run_live(request, lambda message: None)
+    assert "reader" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_sources_that_are_not_there(tmp_path: Path) -> None:

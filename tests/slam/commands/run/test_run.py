@@ -17,6 +17,7 @@ import slam.commands.run.run
 import slam.results.estimate_metrics
 from erfsfm.common.signals import Terminated
 from slam import run_slam
+from slam.commands.run import job
 from slam.config.sections import PoseGraphConfig
 from slam.graph.pose_graph import PoseGraph
 from slam.pipeline.batch import SlamPipeline
@@ -164,8 +165,26 @@ def test_unreadable_scans_are_left_out_and_reported(
         assert "000006.bin is no Velodyne scan" in (folder.path / name).read_text()
     for scan in scans.iterdir():
         scan.write_bytes(b"12345")
-    metrics = check_run(run_slam(**reported | {"dataset": root, "frames": None}).path)
+    again = reported | {"dataset": root, "frames": None}
+    metrics = check_run(run_slam(**again).path)
     assert metrics["trajectories"]["lidar_reason"].startswith("4 of 4 LiDAR scans cannot be read")
+    with pytest.raises(SlamError, match=r"scale\.mode=lidar: 4 of 4 LiDAR scans cannot be read"):
+        run_slam(**again | {"overrides": [*reported.get("overrides", ()), "scale.mode=lidar"]})
+
+
+def test_a_run_that_is_killed_while_its_report_is_written_has_not_ended(
+    reported: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, write = [], job.write_report
+
+    def spied(folder: RunFolder, *parts: Any) -> None:
+        seen.append(folder.metrics().status)
+        write(folder, *parts)
+
+    monkeypatch.setattr(job, "write_report", spied)
+    folder = run_slam(**reported, output=tmp_path / "run")
+    assert seen == ["estimated"] and folder.metrics().status == "ok"
+    assert ">FAILED<" not in (folder.path / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

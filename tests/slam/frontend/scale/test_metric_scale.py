@@ -103,13 +103,6 @@ def test_lidar_gives_metres_where_no_road_step_and_no_height_is_known(height_m: 
     assert_lengths(scale, {ends: metres(ends) for ends in SINGLE}, 0.01)
 
 
-def test_without_a_lidar_step_and_a_height_nothing_is_in_metres() -> None:
-    scale = find("lidar", measured(lidar=0), None)
-    assert not scale.is_metric
-    assert isinstance(scale.estimate, MeasurementFailure)
-    assert "height of the camera is unknown" in scale.estimate.reason
-
-
 def test_lidar_measures_its_steps_and_the_height_for_the_others():
     """The camera is really 2 m high; the height given is missing or wrong."""
     for given in (None, HEIGHT_M):

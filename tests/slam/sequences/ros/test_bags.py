@@ -209,6 +209,16 @@ def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
+    bag.image("/depth/image_raw", FIRST_NS, np.ones((24, 40), np.uint16), "16UC1")
+    path = bag.close()
+    with pytest.raises(SequenceError, match=r"no topic with images of a camera: it holds .*/depth/image_raw \(sensor"):
+        open_sequence(path)
+    assert examine(path)[-1].startswith("missing")
+
+
 def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "walk.bag").write_bytes(b"")
 

@@ -8,14 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam.frames import LOOP_SOURCE, Ends, Intrinsics, RelativePose
+from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.odometry import MapSegment
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.se3 import FloatArray, apply, invert
 
-KEYFRAME_SOURCE = "window"  # in metrics.json
 _LEAST_DEPTHS = 20
 _LEAST_LENGTH = 1e-6
 _RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of its step
@@ -71,12 +70,21 @@ def keyframe_poses(
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}
     units: dict[int, float] = {}
+    turns: list[RelativePose] = []
     for number, segment in enumerate(part for part in maps if part.started):
         found = _segment_poses(segment, intrinsics, seed)
         poses += found
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
+        turns += [turn.scaled(_median_depth(segment.map)) for turn in segment.turns]
         units[number] = learned_unit(segment.map)
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
+    outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
+    for ordered, known, new in ((outside, 0, 1), (outside[::-1], 1, 0)):
+        for turn in ordered:
+            number = segments.get(turn.ends[known])
+            if number is not None:
+                segments.setdefault(turn.ends[new], number)
+    poses += [turn for turn in outside if turn.from_index in segments]
     return KeyframePoses(poses, segments, [closing[ends] for ends in loops], units)
 
 
@@ -129,6 +137,12 @@ def learned_unit(local: LocalMap) -> float:
             ratios.append(ratio[np.isfinite(ratio) & (ratio > 0)])
     joined = np.concatenate(ratios)
     return float(np.median(joined)) if len(joined) >= _LEAST_DEPTHS else 1.0
+
+
+def _median_depth(local: LocalMap) -> float:
+    """Of the points seen by keyframes."""
+    depths = [apply(k.T_camera_world, local.points[k.track_ids])[:, 2] for k in local.keyframes]
+    return float(np.nanmedian(np.concatenate(depths)))
 
 
 def _seen_from(

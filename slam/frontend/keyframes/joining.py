@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise
 from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.odometry import MapSegment, TrackedFrame
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.geometry.se3 import FloatArray, apply, invert
 
 logger = logging.getLogger(__name__)

@@ -15,16 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
-from slam.frames import KEYFRAME_SOURCE, DepthMap, Event, Frame, Intrinsics, RelativePose, TrackingEvent
+from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import Thumbnail, flow, image_shift, new_corners
 from slam.frontend.keyframes.initialisation import View, first_points
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
+from slam.frontend.keyframes.turns import is_turn, rotation_and_parallax, turn_since
 from slam.frontend.sparse_flow import Pixels
-from slam.frontend.visual.epipolar import parallax_px, rotation_between
-from slam.geometry.se3 import FloatArray, invert, make
+from slam.frontend.visual.epipolar import parallax_px
+from slam.geometry.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
 
@@ -34,41 +36,10 @@ _START_KEYFRAMES = 3
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
-_START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.3  # seconds without a pose after which a new map is begun
-# of a turn without translation: radians, and depths
-_TURN_SIGMA, _TURN_LENGTH = np.deg2rad(0.1), 0.01
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost."""
-
-    index: int
-    track_ids: TrackIds
-    pixels: Pixels
-    T_camera_world: FloatArray | None
-    keyframe: int  # the last one, by its place among the map's
-
-
-@dataclass
-class MapSegment:
-    """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points.
-
-    ``turns`` are rotations of the camera where it has no points, before the first or after the last; lengths in depths.
-    """
-
-    map: LocalMap = field(default_factory=LocalMap)
-    frames: list[TrackedFrame] = field(default_factory=list)
-    started: bool = False
-    turns: list[RelativePose] = field(default_factory=list)
-
-    def copy(self) -> MapSegment:
-        """A snapshot, which stays while this map grows."""
-        return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())
 
 
 @dataclass
@@ -239,8 +210,7 @@ class KeyframeOdometry:
             return False
         pixels = pixels[seen]
         rays_first, rays = intrinsics.rays(first.pixels[rows]), intrinsics.rays(pixels.astype(np.float64))
-        unexplained = parallax_px(rays_first, rays, rotation_between(rays_first, rays), intrinsics)
-        if np.median(unexplained) < _START_PARALLAX_RATIO * intrinsics.width:
+        if is_turn(rotation_and_parallax(rays_first, rays, intrinsics)[1], intrinsics):
             return False
         frames = [frame for frame in segment.frames if frame.index > first.index]
         between = [_common(track_ids, each) for each in _spread(frames[:-1])]
@@ -259,24 +229,12 @@ class KeyframeOdometry:
         return True
 
     def _note_turn(self, keyframe: TrackedKeyframe, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
-        """How the camera turned since a keyframe, from corners with points or without, if that explains them."""
-        intrinsics = self._intrinsics
-        if len(track_ids) < MIN_POINTS:
-            return
-        before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
-        rays_before, rays = intrinsics.rays(before), intrinsics.rays(pixels.astype(np.float64))
-        R = rotation_between(rays_before, rays)
-        unexplained = float(np.median(parallax_px(rays_before, rays, R, intrinsics)))
-        if unexplained > _START_PARALLAX_RATIO * intrinsics.width:
-            return
-        angle = unexplained / intrinsics.fx
-        sigmas = np.repeat([np.hypot(_TURN_SIGMA, angle), _TURN_LENGTH + 2.0 * angle], 3)
-        turn = RelativePose(keyframe.index, frame.index, make(R.T, np.zeros(3)), sigmas, KEYFRAME_SOURCE)
-        (self.lost_map() or self._state.segments[-1]).turns.append(turn)
+        """Keep how the camera turned since a keyframe, where it has no other pose."""
+        turn = turn_since(keyframe, frame.index, track_ids, pixels, self._intrinsics)
+        if turn is not None:
+            (self.lost_map() or self._state.segments[-1]).turns.append(turn)
 
-    def _locate(
-        self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, since: float
-    ) -> None:
+    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, since: float) -> None:
         """The camera's pose from known points."""
         state, known = self._state, segment.map.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, state.turn, self._intrinsics)

@@ -11,7 +11,7 @@ import numpy as np
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.se3 import FloatArray, apply, invert
 

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from slam.config.sections import KeyframesConfig
-from slam.frames import TrackingEvent
+from slam.frames import RelativePose, TrackingEvent
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState, MapSegment, TrackedFrame
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
 from slam.frontend.keyframes.relative_poses import KEYFRAME_SOURCE, KeyframePoses, keyframe_poses
 from slam.geometry.se3 import FloatArray, rotation_angle, umeyama
 from slam.runtime.storage.serialisation import Serialiser
@@ -102,7 +103,8 @@ def test_another_scene_begins_another_map() -> None:
 def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     truth = room.walk(40)
     whole = poses(room.tracked(CONFIG, truth))
-    serialiser = Serialiser(KeyframeOdometryState, MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent)
+    records = MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent, RelativePose
+    serialiser = Serialiser(KeyframeOdometryState, *records)
     serialiser.write(tmp_path / "state", room.tracked(CONFIG, truth[:25]))
     odometry = KeyframeOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
     for k in range(25, 40):

@@ -23,7 +23,7 @@ from slam.frontend.keyframes.initialisation import View, first_points
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
-from slam.frontend.keyframes.turns import is_turn, rotation_and_parallax, turn_since
+from slam.frontend.keyframes.turns import is_turn, rotation_and_parallax, turn_by_shift, turn_since
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
 from slam.geometry.se3 import FloatArray, invert
@@ -136,6 +136,9 @@ class KeyframeOdometry:
         segment = self._state.segments[-1]
         track_ids, pixels = self._track(segment, frame, shift)
         self._measure_turn(segment, track_ids, pixels, since)
+        if len(track_ids) < MIN_POINTS and shift.any():
+            before = max(each.index for each in (*segment.frames[-1:], segment.map.keyframes[-1]))
+            self._turning().turns.append(turn_by_shift(before, frame.index, shift, self._intrinsics))
         if segment.started:
             self._locate(segment, frame, track_ids, pixels, since)
         else:
@@ -232,7 +235,11 @@ class KeyframeOdometry:
         """Keep how the camera turned since a keyframe, where it has no other pose."""
         turn = turn_since(keyframe, frame.index, track_ids, pixels, self._intrinsics)
         if turn is not None:
-            (self.lost_map() or self._state.segments[-1]).turns.append(turn)
+            self._turning().turns.append(turn)
+
+    def _turning(self) -> MapSegment:
+        """The map to which turns belong: the lost one, else the newest."""
+        return self.lost_map() or self._state.segments[-1]
 
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, since: float) -> None:
         """The camera's pose from known points."""

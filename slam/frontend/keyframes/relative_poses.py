@@ -82,9 +82,9 @@ def keyframe_poses(
     for ordered, known, new in ((outside, 0, 1), (outside[::-1], 1, 0)):
         for turn in ordered:
             number = segments.get(turn.ends[known])
-            if number is not None:
+            if number is not None and turn.source == KEYFRAME_SOURCE:
                 segments.setdefault(turn.ends[new], number)
-    poses += [turn for turn in outside if turn.from_index in segments]
+    poses += [turn for turn in outside if turn.from_index in segments or turn.source != KEYFRAME_SOURCE]
     return KeyframePoses(poses, segments, [closing[ends] for ends in loops], units)
 
 

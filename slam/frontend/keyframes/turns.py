@@ -12,9 +12,11 @@ from slam.frontend.keyframes.camera_pose import MIN_POINTS
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
-from slam.geometry.se3 import FloatArray, make
+from slam.geometry.se3 import FloatArray, from_rotation_vector, make
 
 _LEAST_PARALLAX_RATIO = 0.0125  # median parallax from which on two views give points, over the image width
+SHIFT_SOURCE = "image shift"  # in metrics.json
+_SHIFT_SIGMA, _SHIFT_LENGTH = np.deg2rad(2.0), 0.1
 _ROTATION_SIGMA, _LENGTH_SIGMA = np.deg2rad(0.1), 0.01  # least sigmas, radians and depths
 
 
@@ -53,3 +55,11 @@ def turn_since(
     angle = parallax / intrinsics.fx
     sigmas = np.repeat([np.hypot(_ROTATION_SIGMA, angle), _LENGTH_SIGMA + 2.0 * angle], 3)
     return RelativePose(keyframe.index, index, make(R.T, np.zeros(3)), sigmas, KEYFRAME_SOURCE)
+
+
+def turn_by_shift(first: int, last: int, shift: Pixels, intrinsics: Intrinsics) -> RelativePose:
+    """Between two frames whose images moved as a whole by ``shift`` ``(2,)`` pixels: a turn rather than a step."""
+    yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
+    T_first_last = from_rotation_vector(np.array([pitch, -yaw, 0.0]), np.zeros(3))
+    sigmas = np.repeat([_SHIFT_SIGMA, _SHIFT_LENGTH], 3)
+    return RelativePose(first, last, T_first_last, sigmas, SHIFT_SOURCE)

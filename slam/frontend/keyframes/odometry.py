@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
-from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
+from slam.frames import DepthMap, Event, Frame, Intrinsics, RelativePose, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import Thumbnail, flow, image_shift, new_corners
@@ -37,7 +37,7 @@ _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
-_MAX_LOST_S = 0.3  # seconds without a pose after which a new map is begun
+_MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
 
@@ -136,9 +136,8 @@ class KeyframeOdometry:
         segment = self._state.segments[-1]
         track_ids, pixels = self._track(segment, frame, shift)
         self._measure_turn(segment, track_ids, pixels, since)
-        if len(track_ids) < MIN_POINTS and shift.any():
-            before = max(each.index for each in (*segment.frames[-1:], segment.map.keyframes[-1]))
-            self._turning().turns.append(turn_by_shift(before, frame.index, shift, self._intrinsics))
+        if len(track_ids) < MIN_POINTS:
+            self._keep_turn(turn_by_shift(segment.last_tracked, frame.index, shift, self._intrinsics))
         if segment.started:
             self._locate(segment, frame, track_ids, pixels, since)
         else:
@@ -198,11 +197,11 @@ class KeyframeOdometry:
                 self._add_keyframe(segment, frame, track_ids, places)
                 segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
                 return
-        self._note_turn(last, frame, track_ids, pixels)
+        self._keep_turn(turn_since(last, frame.index, track_ids, pixels, self._intrinsics))
         if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), _LEAST_START_TRACKS):
-            shared = (np.isin(track_ids, keyframe.track_ids).sum() for keyframe in local.keyframes)
-            kept = [k for k, count in zip(local.keyframes, shared, strict=True) if count >= _LEAST_START_TRACKS]
-            local.keyframes[:] = kept
+            local.keyframes[:] = [
+                k for k in local.keyframes if np.isin(track_ids, k.track_ids).sum() >= _LEAST_START_TRACKS
+            ]
             self._add_keyframe(segment, frame, track_ids, places)
 
     def _started(self, segment: MapSegment, first: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> bool:
@@ -231,15 +230,10 @@ class KeyframeOdometry:
         self._add_first_keyframes(segment, later)
         return True
 
-    def _note_turn(self, keyframe: TrackedKeyframe, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
-        """Keep how the camera turned since a keyframe, where it has no other pose."""
-        turn = turn_since(keyframe, frame.index, track_ids, pixels, self._intrinsics)
+    def _keep_turn(self, turn: RelativePose | None) -> None:
+        """Keep a turn with the map in which the camera is lost, else with the newest."""
         if turn is not None:
-            self._turning().turns.append(turn)
-
-    def _turning(self) -> MapSegment:
-        """The map to which turns belong: the lost one, else the newest."""
-        return self.lost_map() or self._state.segments[-1]
+            (self.lost_map() or self._state.segments[-1]).turns.append(turn)
 
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, since: float) -> None:
         """The camera's pose from known points."""
@@ -250,8 +244,8 @@ class KeyframeOdometry:
             state.lost += 1
             state.T_last_step = np.eye(4)
             segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, len(segment.map.keyframes) - 1))
-            self._note_turn(segment.map.keyframes[-1], frame, track_ids, pixels)
-            if len(track_ids) < _LEAST_START_TRACKS or state.lost * since > _MAX_LOST_S:
+            self._keep_turn(turn_since(segment.map.keyframes[-1], frame.index, track_ids, pixels, self._intrinsics))
+            if (state.lost + 1) * since > _MAX_LOST_S:
                 self._begin(frame)
             return
         state.lost = 0

@@ -57,8 +57,10 @@ def turn_since(
     return RelativePose(keyframe.index, index, make(R.T, np.zeros(3)), sigmas, KEYFRAME_SOURCE)
 
 
-def turn_by_shift(first: int, last: int, shift: Pixels, intrinsics: Intrinsics) -> RelativePose:
-    """Between two frames whose images moved as a whole by ``shift`` ``(2,)`` pixels: a turn rather than a step."""
+def turn_by_shift(first: int, last: int, shift: Pixels, intrinsics: Intrinsics) -> RelativePose | None:
+    """Between two frames whose images moved as a whole by ``shift`` ``(2,)`` pixels; None where they did not."""
+    if not shift.any():
+        return None
     yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
     T_first_last = from_rotation_vector(np.array([pitch, -yaw, 0.0]), np.zeros(3))
     sigmas = np.repeat([_SHIFT_SIGMA, _SHIFT_LENGTH], 3)

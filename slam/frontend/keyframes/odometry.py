@@ -18,7 +18,7 @@ from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, RelativePose, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
-from slam.frontend.keyframes.flow import Thumbnail, flow, image_shift, new_corners
+from slam.frontend.keyframes.flow import SURE_RESPONSE, Thumbnail, flow, image_shift, new_corners
 from slam.frontend.keyframes.initialisation import View, first_points
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
@@ -128,7 +128,7 @@ class KeyframeOdometry:
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
-        shift, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
+        shift, response, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
         since, self._state.stamp = frame.stamp - self._state.stamp, frame.stamp
         if not self._state.segments:
             self._begin(frame)
@@ -136,7 +136,7 @@ class KeyframeOdometry:
         segment = self._state.segments[-1]
         track_ids, pixels = self._track(segment, frame, shift)
         self._measure_turn(segment, track_ids, pixels, since)
-        if len(track_ids) < MIN_POINTS:
+        if len(track_ids) < MIN_POINTS and response > SURE_RESPONSE:
             self._keep_turn(turn_by_shift(segment.last_tracked, frame.index, shift, self._intrinsics))
         if segment.started:
             self._locate(segment, frame, track_ids, pixels, since)

@@ -42,7 +42,7 @@ def new_corners(grey: Grey, taken: Pixels, count: int) -> Pixels:
 
 
 def image_shift(before: Thumbnail, grey: Grey) -> tuple[Pixels, float, Thumbnail]:
-    """By how many pixels ``(2,)`` an image moved since the one before, as a turning camera's does; its response and thumbnail.
+    """By how many pixels ``(2,)`` an image moved since the one before, how sure that is, and its thumbnail.
 
     By the phase correlation of reduced images (Kuglin and Hines 1975). Zero where they do not correlate, where flow
     finds so small a shift by itself, and without an image before.

@@ -131,8 +131,7 @@ class KeyframeOdometry:
         shift, response, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
         since, self._state.stamp = frame.stamp - self._state.stamp, frame.stamp
         if not self._state.segments:
-            self._begin(frame)
-            return
+            return self._begin(frame)
         segment = self._state.segments[-1]
         track_ids, pixels = self._track(segment, frame, shift)
         self._measure_turn(segment, track_ids, pixels, since)
@@ -199,9 +198,8 @@ class KeyframeOdometry:
                 return
         self._keep_turn(turn_since(last, frame.index, track_ids, pixels, self._intrinsics))
         if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), _LEAST_START_TRACKS):
-            local.keyframes[:] = [
-                k for k in local.keyframes if np.isin(track_ids, k.track_ids).sum() >= _LEAST_START_TRACKS
-            ]
+            seen = (k for k in local.keyframes if np.isin(track_ids, k.track_ids).sum() >= _LEAST_START_TRACKS)
+            local.keyframes[:] = list(seen)
             self._add_keyframe(segment, frame, track_ids, places)
 
     def _started(self, segment: MapSegment, first: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> bool:

@@ -30,6 +30,7 @@ Descriptors = NDArray[np.uint8]
 Event = Literal["map begun", "lost", "relocalised", "map joined"]  # of the tracking of keyframes
 Ends = tuple[int, int]  # the two frames of a step or a factor
 LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may drop these
+KEYFRAME_SOURCE = "window"  # in metrics.json
 _SURFACE_STEP = 0.12  # relative depth step between neighbouring pixels of one surface
 _TIE_PX = np.float32(1e-3)  # of two pixels equally near that right and below, on a road the nearer one
 

@@ -24,7 +24,7 @@ from slam.frames import (
     runs,
 )
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane

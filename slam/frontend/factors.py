@@ -9,11 +9,11 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig
-from slam.frames import Ends, RelativePose
+from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.keyframes.gaps import join_gap_ends
-from slam.frontend.keyframes.relative_poses import KEYFRAME_SOURCE, KeyframePoses
+from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
     STUDENT_T_DOF,
@@ -74,9 +74,12 @@ def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePo
 
 
 def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:
-    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
+    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent.
+
+    A turn between frames without a map has no length; its sigmas take the unit of the first map.
+    """
     units = {number: maps.learned_units[number] * unit for number, unit in depth_units(maps, scale).items()}
-    return [pose.scaled(units[maps.segments[pose.from_index]]) for pose in poses]
+    return [pose.scaled(units[maps.segments.get(pose.from_index, 0)]) for pose in poses]
 
 
 def depth_units(maps: KeyframePoses, scale: Scale) -> dict[int, float]:

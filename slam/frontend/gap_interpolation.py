@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
 from slam.frontend.drive import Drive
-from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.segments import find_cuts, find_segments

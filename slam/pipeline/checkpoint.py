@@ -22,7 +22,8 @@ from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.odometry import KeyframeOdometryState, MapSegment, TrackedFrame
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.odometry import KeyframeOdometryState
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane

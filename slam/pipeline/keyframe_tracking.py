@@ -14,7 +14,8 @@ from slam.frontend.drive import Drive
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import new_corners
 from slam.frontend.keyframes.local_map import LocalMap
-from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState, MapSegment
+from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses, learned_unit
 from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser

@@ -16,7 +16,7 @@ from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import depth_units, scaled_poses
 from slam.frontend.keyframes.joining import SharedCorners, join
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses, learned_unit
 from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, apply, invert, make

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise
 from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.odometry import MapSegment, TrackedFrame
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.geometry.se3 import FloatArray, apply, invert
 
 logger = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ def _moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) 
     for frame in segment.frames:
         row = max(int(np.searchsorted(indices, frame.index, side="right")) - 1, 0)
         frames.append(_followed(frame, before.keyframes[row].T_camera_world, T_camera_world[row], scales[row]))
-    return MapSegment(LocalMap(keyframes, points), frames, segment.started)
+    return MapSegment(LocalMap(keyframes, points), frames, segment.started, segment.turns)
 
 
 def _followed(
@@ -106,7 +106,8 @@ def _united(segments: Sequence[MapSegment]) -> MapSegment:
         frames += [replace(frame, track_ids=frame.track_ids + first) for frame in segment.frames]
         first += len(segment.map.points)
     points = np.concatenate([segment.map.points for segment in segments])
-    return MapSegment(LocalMap(keyframes, points), frames, started=True)
+    turns = [turn for segment in segments for turn in segment.turns]
+    return MapSegment(LocalMap(keyframes, points), frames, True, turns)
 
 
 def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[SharedCorners]) -> TrackIds:
@@ -139,7 +140,7 @@ def _renumbered(segment: MapSegment, tracks: TrackIds) -> MapSegment:
     lonely = np.flatnonzero(np.isnan(points[tracks, 0]) & np.isfinite(points[:, 0]))
     points[tracks[lonely]] = points[lonely]
     frames = [replace(frame, track_ids=tracks[frame.track_ids]) for frame in segment.frames]
-    return MapSegment(LocalMap(keyframes, points), frames, started=True)
+    return MapSegment(LocalMap(keyframes, points), frames, True, segment.turns)
 
 
 def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:

@@ -32,7 +32,9 @@ _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
 # a point that two keyframes do not find is hidden
 _ATTEMPTS = 2
-_MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
+_MIN_ANGLE_DEG = 0.3  # least angle between rays of a point, degrees
+# least distance over the usual depth: poses are less exact, and near points pass the angle where a camera only turns
+_MIN_BASELINE = 0.01
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
@@ -125,8 +127,19 @@ class LocalMap:
         error = reprojection_errors(T, X[row], ray, (intrinsics.fx, intrinsics.fy))
         worst = np.zeros(len(track_ids))
         np.maximum.at(worst, row, error)
-        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX)
+        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX) & self._has_baseline(T, row, len(track_ids))
         self.points[track_ids[good]] = X[good]
+
+    def _has_baseline(self, T_camera_world: FloatArray, row: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+        """Which of ``count`` tracks are seen from places far enough apart; sightings are of tracks ``row``."""
+        newest = self.keyframes[-1]
+        known = newest.track_ids[self.known(newest.track_ids)]
+        depth = np.median(apply(newest.T_camera_world, self.points[known])[:, 2]) if len(known) else 0.0
+        centres = invert(T_camera_world)[:, :3, 3]
+        least, most = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+        np.minimum.at(least, row, centres)
+        np.maximum.at(most, row, centres)
+        return np.asarray(np.linalg.norm(most - least, axis=1) > _MIN_BASELINE * depth)
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
         """Adjust the last keyframes and their points; older ones that see many of these points stay fixed.

@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
-from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
+from slam.frames import DepthMap, Event, Frame, Intrinsics, RelativePose, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
-from slam.frontend.keyframes.flow import Thumbnail, flow, image_shift, new_corners
+from slam.frontend.keyframes.flow import SURE_RESPONSE, Thumbnail, flow, image_shift, new_corners
 from slam.frontend.keyframes.initialisation import View, first_points
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
+from slam.frontend.keyframes.turns import is_turn, rotation_and_parallax, turn_by_shift, turn_since
 from slam.frontend.sparse_flow import Pixels
-from slam.frontend.visual.epipolar import parallax_px, rotation_between
+from slam.frontend.visual.epipolar import parallax_px
 from slam.geometry.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
@@ -34,35 +36,10 @@ _START_KEYFRAMES = 3
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
-_START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
-_MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
+_MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost."""
-
-    index: int
-    track_ids: TrackIds
-    pixels: Pixels
-    T_camera_world: FloatArray | None
-    keyframe: int  # the last one, by its place among the map's
-
-
-@dataclass
-class MapSegment:
-    """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points."""
-
-    map: LocalMap = field(default_factory=LocalMap)
-    frames: list[TrackedFrame] = field(default_factory=list)
-    started: bool = False
-
-    def copy(self) -> MapSegment:
-        """A snapshot, which stays while this map grows."""
-        return replace(self, map=self.map.copy(), frames=self.frames.copy())
 
 
 @dataclass
@@ -151,16 +128,17 @@ class KeyframeOdometry:
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
-        shift, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
+        shift, response, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
         since, self._state.stamp = frame.stamp - self._state.stamp, frame.stamp
-        if not self._state.segments or self._state.lost > _MAX_LOST_FRAMES:
-            self._begin(frame)
-            return
+        if not self._state.segments:
+            return self._begin(frame)
         segment = self._state.segments[-1]
         track_ids, pixels = self._track(segment, frame, shift)
         self._measure_turn(segment, track_ids, pixels, since)
+        if len(track_ids) < MIN_POINTS and response > SURE_RESPONSE:
+            self._keep_turn(turn_by_shift(segment.last_tracked, frame.index, shift, self._intrinsics))
         if segment.started:
-            self._locate(segment, frame, track_ids, pixels)
+            self._locate(segment, frame, track_ids, pixels, since)
         else:
             self._start(segment, frame, track_ids, pixels)
 
@@ -182,11 +160,9 @@ class KeyframeOdometry:
         return {first, last} <= located
 
     def _begin(self, frame: Frame) -> None:
-        """A new map whose first keyframe is this frame; a map that never had points is forgotten."""
+        """A new map whose first keyframe is this frame."""
         state = self._state
-        if state.segments and not state.segments[-1].started:
-            state.segments.pop()
-        elif state.segments:
+        if state.segments:
             self._note(state.segments[-1].frames[-state.lost].index, "lost")
         state.segments.append(MapSegment())
         state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
@@ -211,32 +187,53 @@ class KeyframeOdometry:
         return keyframe.track_ids[rows[kept]], found[kept]
 
     def _start(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
-        """The first points, once the parallax to the first keyframe gives them."""
-        first, intrinsics = segment.map.keyframes[0], self._intrinsics
-        if len(track_ids) < _LEAST_START_TRACKS:
-            self._begin(frame)
-            return
-        places, pixels = pixels, in_middle_row(pixels, self._state.turn, intrinsics)
+        """The first points, once the parallax to one of the keyframes gives them; else another keyframe in time."""
+        local, last = segment.map, segment.map.keyframes[-1]
+        places, pixels = pixels, in_middle_row(pixels, self._state.turn, self._intrinsics)
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, 0))
-        rows = np.searchsorted(first.track_ids, track_ids)
+        for first in local.keyframes:
+            if self._started(segment, first, track_ids, pixels):
+                self._add_keyframe(segment, frame, track_ids, places)
+                segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
+                return
+        self._keep_turn(turn_since(last, frame.index, track_ids, pixels, self._intrinsics))
+        if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), _LEAST_START_TRACKS):
+            seen = (k for k in local.keyframes if np.isin(track_ids, k.track_ids).sum() >= _LEAST_START_TRACKS)
+            local.keyframes[:] = list(seen)
+            self._add_keyframe(segment, frame, track_ids, places)
+
+    def _started(self, segment: MapSegment, first: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> bool:
+        """Whether the parallax between a keyframe without points and the current frame gives the first ones."""
+        intrinsics, local = self._intrinsics, segment.map
+        track_ids, rows, seen = np.intersect1d(first.track_ids, track_ids, assume_unique=True, return_indices=True)
+        if len(track_ids) < _LEAST_START_TRACKS:
+            return False
+        pixels = pixels[seen]
         rays_first, rays = intrinsics.rays(first.pixels[rows]), intrinsics.rays(pixels.astype(np.float64))
-        unexplained = parallax_px(rays_first, rays, rotation_between(rays_first, rays), intrinsics)
-        if np.median(unexplained) < _START_PARALLAX_RATIO * intrinsics.width:
-            return
-        between = [_common(track_ids, each) for each in _spread(segment.frames[:-1])]
+        if is_turn(rotation_and_parallax(rays_first, rays, intrinsics)[1], intrinsics):
+            return False
+        frames = [frame for frame in segment.frames if frame.index > first.index]
+        between = [_common(track_ids, each) for each in _spread(frames[:-1])]
         found = first_points(rays_first, pixels, between, intrinsics, self._seed)
         if found is None:
-            return
-        segment.map.points[track_ids[found.solid]] = found.points[found.solid]
-        segment.started = True
+            return False
+        local.points[track_ids[found.solid]] = found.points[found.solid]
+        segment.started, segment.frames = True, frames
         for before in self._state.segments[:-1]:
             before.map.forget_images()
-        self._note(frame.index, "map begun", support=int(found.solid.sum()))
+        self._note(frames[-1].index, "map begun", support=int(found.solid.sum()))
         self._state.T_camera_world = found.T_current_first
-        self._add_keyframe(segment, frame, track_ids, places)
-        segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
+        later = [keyframe for keyframe in local.keyframes if keyframe.index > first.index]
+        local.keyframes[:] = [first]
+        self._add_first_keyframes(segment, later)
+        return True
 
-    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _keep_turn(self, turn: RelativePose | None) -> None:
+        """Keep a turn with the map in which the camera is lost, else with the newest."""
+        if turn is not None:
+            (self.lost_map() or self._state.segments[-1]).turns.append(turn)
+
+    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, since: float) -> None:
         """The camera's pose from known points."""
         state, known = self._state, segment.map.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, state.turn, self._intrinsics)
@@ -245,6 +242,9 @@ class KeyframeOdometry:
             state.lost += 1
             state.T_last_step = np.eye(4)
             segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, len(segment.map.keyframes) - 1))
+            self._keep_turn(turn_since(segment.map.keyframes[-1], frame.index, track_ids, pixels, self._intrinsics))
+            if (state.lost + 1) * since > _MAX_LOST_S:
+                self._begin(frame)
             return
         state.lost = 0
         before, state.T_camera_world = state.T_camera_world, pose.T_camera_world
@@ -293,8 +293,6 @@ class KeyframeOdometry:
         order = np.argsort(track_ids)
         track_ids, places = track_ids[order], pixels[order].astype(np.float64)
         unknown = np.full(len(track_ids), np.nan)
-        if segment.started and len(local.keyframes) == 1:
-            self._add_first_keyframes(segment)
         middle, descriptors = in_middle_row(places, state.turn, intrinsics), describe(frame.grey, places)
         local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
         if segment.started:
@@ -304,20 +302,23 @@ class KeyframeOdometry:
         state.places = local.keyframes[-1].places.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
 
-    def _add_first_keyframes(self, segment: MapSegment) -> None:
-        """Some of the frames between the first two keyframes: more views of the first points."""
-        for frame in _spread(segment.frames[:-1]):
-            known = segment.map.known(frame.track_ids)
-            if known.sum() < MIN_POINTS:
+    def _add_first_keyframes(self, segment: MapSegment, later: Sequence[TrackedKeyframe]) -> None:
+        """Keyframes and frames between the first two keyframes of a map: more views of the first points."""
+        local, first, pending = segment.map, segment.map.keyframes[0], {each.index: each for each in later}
+        chosen = {frame.index for frame in _spread(segment.frames[:-1])} | pending.keys()
+        for frame in segment.frames[:-1]:
+            known = local.known(frame.track_ids)
+            if frame.index not in chosen or known.sum() < MIN_POINTS:
                 continue
-            points, pixels = segment.map.points[frame.track_ids[known]], frame.pixels[known].astype(np.float64)
-            pose = resect((np.eye(4),), points, pixels, self._intrinsics, self._seed)
-            unknown = np.full(len(frame.track_ids), np.nan)
-            places = frame.pixels.astype(np.float64)
-            first = segment.map.keyframes[0]
-            same = first.descriptors[np.searchsorted(first.track_ids, frame.track_ids)]
-            T = pose.T_camera_world
-            segment.map.add(TrackedKeyframe(frame.index, T, frame.track_ids, places, places, unknown, same, None))
+            points, pixels = local.points[frame.track_ids[known]], frame.pixels[known].astype(np.float64)
+            T = resect((np.eye(4),), points, pixels, self._intrinsics, self._seed).T_camera_world
+            if frame.index in pending:
+                local.add(replace(pending[frame.index], T_camera_world=T))
+                continue
+            _, rows, seen = np.intersect1d(first.track_ids, frame.track_ids, assume_unique=True, return_indices=True)
+            places, unknown = frame.pixels[seen].astype(np.float64), np.full(len(seen), np.nan)
+            same = first.descriptors[rows]
+            local.add(TrackedKeyframe(frame.index, T, frame.track_ids[seen], places, places, unknown, same, None))
 
     def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
         """How fast the camera turns, for a rolling shutter."""

@@ -8,14 +8,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam.frames import LOOP_SOURCE, Ends, Intrinsics, RelativePose
+from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.turns import SHIFT_SOURCE
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.se3 import FloatArray, apply, invert
 
-KEYFRAME_SOURCE = "window"  # in metrics.json
 _LEAST_DEPTHS = 20
 _LEAST_LENGTH = 1e-6
 _RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of its step
@@ -71,13 +71,26 @@ def keyframe_poses(
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}
     units: dict[int, float] = {}
+    turns: list[RelativePose] = []
     for number, segment in enumerate(part for part in maps if part.started):
         found = _segment_poses(segment, intrinsics, seed)
         poses += found
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
+        turns += [turn.scaled(_median_depth(segment.map)) for turn in segment.turns]
         units[number] = learned_unit(segment.map)
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
+    outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
+    _connect(segments, outside)
+    poses += [turn for turn in outside if turn.from_index in segments or turn.source == SHIFT_SOURCE]
     return KeyframePoses(poses, segments, [closing[ends] for ends in loops], units)
+
+
+def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
+    """Give frames that turns lead to, from a map or back from one, the number of that map."""
+    for ordered, known, new in ((turns[::-1], 1, 0), (turns, 0, 1)):
+        for turn in ordered:
+            if turn.source == KEYFRAME_SOURCE and turn.ends[known] in segments:
+                segments.setdefault(turn.ends[new], segments[turn.ends[known]])
 
 
 def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
@@ -129,6 +142,12 @@ def learned_unit(local: LocalMap) -> float:
             ratios.append(ratio[np.isfinite(ratio) & (ratio > 0)])
     joined = np.concatenate(ratios)
     return float(np.median(joined)) if len(joined) >= _LEAST_DEPTHS else 1.0
+
+
+def _median_depth(local: LocalMap) -> float:
+    """Of the points seen by keyframes."""
+    depths = [apply(k.T_camera_world, local.points[k.track_ids])[:, 2] for k in local.keyframes]
+    return float(np.nanmedian(np.concatenate(depths)))
 
 
 def _seen_from(

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from slam.config.sections import KeyframesConfig
-from slam.frames import TrackingEvent
+from slam.frames import KEYFRAME_SOURCE, RelativePose, TrackingEvent
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState, MapSegment, TrackedFrame
-from slam.frontend.keyframes.relative_poses import KEYFRAME_SOURCE, KeyframePoses, keyframe_poses
-from slam.geometry.se3 import FloatArray, rotation_angle, umeyama
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
+from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.runtime.storage.serialisation import Serialiser
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).with_name("room.py"))
@@ -102,7 +103,8 @@ def test_another_scene_begins_another_map() -> None:
 def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     truth = room.walk(40)
     whole = poses(room.tracked(CONFIG, truth))
-    serialiser = Serialiser(KeyframeOdometryState, MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent)
+    records = MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent, RelativePose
+    serialiser = Serialiser(KeyframeOdometryState, *records)
     serialiser.write(tmp_path / "state", room.tracked(CONFIG, truth[:25]))
     odometry = KeyframeOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
     for k in range(25, 40):
@@ -113,3 +115,19 @@ def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     for one, other in zip(whole.poses, resumed.poses, strict=True):
         np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
         np.testing.assert_array_equal(one.sigmas, other.sigmas)
+
+
+def test_a_turn_before_the_first_points_is_measured() -> None:
+    """A walk that begins with a turn of 33 degrees, by 3 a frame: no corner of the first image is left in the end."""
+    yaw = np.deg2rad(np.arange(-33.0, 0.0, 3.0))
+    turned = from_rotation_vector(np.outer(yaw, [0.0, 1.0, 0.0]), np.zeros((len(yaw), 3)))
+    truth = np.concatenate([turned, room.walk(30)])
+    state = room.tracked(CONFIG, truth)
+    begun = state.segments[0].map.keyframes[0].index
+    found = poses(state)
+    assert 4 <= begun <= 14
+    assert sorted(found.segments) == list(range(len(truth)))
+    for pose in found.poses:
+        T_true = invert(truth[pose.from_index]) @ truth[pose.to_index]
+        assert np.rad2deg(rotation_angle(pose.T_from_to[:3, :3].T @ T_true[:3, :3])) < 1.0
+        assert pose.from_index >= begun or np.linalg.norm(pose.T_from_to[:3, 3]) == 0.0

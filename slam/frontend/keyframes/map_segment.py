@@ -1,0 +1,43 @@
+"""One map of keyframes with the frames that were located in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from slam.frames import RelativePose
+from slam.frontend.keyframes.local_map import LocalMap, TrackIds
+from slam.frontend.sparse_flow import Pixels
+from slam.geometry.se3 import FloatArray
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost."""
+
+    index: int
+    track_ids: TrackIds
+    pixels: Pixels
+    T_camera_world: FloatArray | None
+    keyframe: int  # the last one, by its place among the map's
+
+
+@dataclass
+class MapSegment:
+    """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points.
+
+    ``turns`` are rotations of the camera where it has no points, before the first or after the last; lengths in depths.
+    """
+
+    map: LocalMap = field(default_factory=LocalMap)
+    frames: list[TrackedFrame] = field(default_factory=list)
+    started: bool = False
+    turns: list[RelativePose] = field(default_factory=list)
+
+    @property
+    def last_tracked(self) -> int:
+        """The frame that was tracked last, or the first keyframe."""
+        return max(self.map.keyframes[-1].index, *(frame.index for frame in self.frames[-1:]), 0)
+
+    def copy(self) -> MapSegment:
+        """A snapshot, which stays while this map grows."""
+        return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())

@@ -16,6 +16,7 @@ from slam.frames import (
     Ends,
     Frame,
     Image,
+    Intrinsics,
     RelativePose,
     SnippetPoses,
     TrackingEvent,
@@ -32,6 +33,7 @@ from slam.frontend.segments import Segment
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.geometry.se3 import FloatArray
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
@@ -69,6 +71,14 @@ class Keyframe:
     def depth_unscaled(self) -> DepthMap:
         """``(h, w)``."""
         return self.spilled_depth.read()
+
+    def cloud_unscaled(self, intrinsics: Intrinsics, stride: int) -> FloatArray:
+        """Points ``(M, 3)`` in its camera, of every ``stride``-th pixel; intrinsics of any size."""
+        depth = self.depth_unscaled
+        camera = intrinsics.resized(*depth.shape[::-1])
+        v, u = np.mgrid[: camera.height : stride, : camera.width : stride].reshape(2, -1)
+        points = camera.rays(np.column_stack([u, v])) * depth[v, u, None]
+        return np.asarray(points[points[:, 2] > 0])
 
 
 @dataclass

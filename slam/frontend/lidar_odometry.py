@@ -98,3 +98,18 @@ def lidar_steps(path: LidarPath) -> list[RelativePose]:
         for first, second, T in zip(path.frames[:-1], path.frames[1:], T_previous_current, strict=True)
         if second == first + 1
     ]
+
+
+def usable_steps(path: LidarPath | MeasurementFailure | None, are_needed: bool) -> list[RelativePose]:
+    """The steps of a path, with a warning where it failed.
+
+    Raises:
+        SlamError: there are none, and they ``are_needed`` for all lengths.
+    """
+    steps = lidar_steps(path) if isinstance(path, LidarPath) else []
+    reason = path.reason if isinstance(path, MeasurementFailure) else "no two neighbouring scans can be read"
+    if are_needed and not steps:
+        raise SlamError(f"scale.mode=lidar: {reason}: leave the setting out, or give a sequence with scans")
+    if isinstance(path, MeasurementFailure):
+        logger.warning("%s: the run goes on without LiDAR", reason)
+    return steps

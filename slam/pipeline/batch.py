@@ -20,7 +20,7 @@ from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, lidar_steps
+from slam.frontend.lidar_odometry import LIDAR_SOURCE, lidar_path, usable_steps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale, find_scale, height_by_lidar
 from slam.frontend.scale.scale_estimate import (
@@ -45,7 +45,7 @@ from slam.pipeline.keyframe_depth import KeyframeDepths
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
-from slam.runtime.errors import SequenceError, SlamError
+from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
@@ -145,7 +145,7 @@ class SlamPipeline:
         T_network = chain_raw(drive.snippets, len(drive))
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence, self._progress)
-        steps = self._lidar_steps(lidar)
+        steps = usable_steps(lidar, are_needed=self.mode == "lidar")
         agreements = self._compared(drive, steps, state)
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
@@ -185,16 +185,6 @@ class SlamPipeline:
             confidence=agreement.confidence([*(each for each in agreements if not each.is_wrong), *of_images]),
             support=support,
         )
-
-    def _lidar_steps(self, lidar: LidarPath | MeasurementFailure | None) -> list[RelativePose]:
-        """Steps by LiDAR; ``SlamError`` where there are none and lengths are by LiDAR alone."""
-        steps = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
-        reason = lidar.reason if isinstance(lidar, MeasurementFailure) else "no two neighbouring scans can be read"
-        if self.mode == "lidar" and not steps:
-            raise SlamError(f"scale.mode=lidar: {reason}: leave the setting out, or give a sequence with scans")
-        if isinstance(lidar, MeasurementFailure):
-            logger.warning("%s: the run goes on without LiDAR", reason)
-        return steps
 
     def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:
         """LiDAR and depth from elsewhere beside the images; ``SlamError`` where lengths by LiDAR alone are wrong."""

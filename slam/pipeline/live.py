@@ -15,7 +15,6 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
-from slam.frontend.drive import Keyframe
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
 from slam.loops.structure import PlaceStructure
@@ -309,15 +308,9 @@ class Slam:
         Of every ``stride``-th pixel. Without ``output.keep=keyframes`` no frame is kept.
         """
         self._observer.flush()
-        kept = self._observer.drive.keyframes
-        return {each.index: self._cloud(each, stride) for each in kept if each.index >= first}
-
-    def _cloud(self, keyframe: Keyframe, stride: int) -> FloatArray:
-        depth = keyframe.depth_unscaled
-        camera = self._sequence.intrinsics.resized(*depth.shape[::-1])
-        v, u = np.mgrid[: camera.height : stride, : camera.width : stride].reshape(2, -1)
-        points = camera.rays(np.column_stack([u, v])) * (self._poses.unit * depth[v, u, None])
-        return np.asarray(points[points[:, 2] > 0])
+        kept = (each for each in self._observer.drive.keyframes if each.index >= first)
+        camera, unit = self._sequence.intrinsics, self._poses.unit
+        return {each.index: unit * each.cloud_unscaled(camera, stride) for each in kept}
 
     def _solved(self) -> Estimate:
         """Of the whole drive so far."""

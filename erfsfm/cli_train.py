@@ -1,0 +1,108 @@
+"""The commands of ``erfsfm`` that train: networks, the fusion of depth, and packs of their data."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from erfsfm.cli_options import Device, Json, Seed, Weights, print_rows
+from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.progress import progress_bar
+
+logger = logging.getLogger(__name__)
+
+
+def train(
+    config: Annotated[str, typer.Option(help="a YAML file, or the name of a shipped configuration")],
+    dataset: Annotated[
+        list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder, video or pack; repeat")
+    ] = None,
+    output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
+    resume: Annotated[bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")] = False,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+    seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
+    device: Device = "auto",
+) -> None:
+    """Train without labels; OUTPUT is what --weights takes.
+
+    Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
+    """
+    from erfsfm.config import load_experiment
+    from erfsfm.training.comparison import depth_before_and_after
+    from erfsfm.training.run import train as run_training
+
+    changes = list(overrides or [])
+    if seed is not None:
+        changes.append(f"training.seed={seed}")
+    experiment = load_experiment(config, changes).with_roots(dataset or [])
+    command = shlex.join(["erfsfm", *sys.argv[1:]])
+    with progress_bar() as progress:
+        folder = run_training(experiment, output, resume, device, command, progress)
+        typer.echo(f"weights in {folder}: use them with --weights {folder}")
+        if experiment.initial_weights is None or experiment.data.validation_share == 0:
+            return
+        try:
+            rows = depth_before_and_after(experiment, folder, device, progress)
+        except ErfsfmError as error:
+            logger.warning("depth before and after training was not compared: %s", error)
+            return
+    print_rows(rows, as_json=False)
+
+
+def train_fusion(
+    dataset: Annotated[list[Path], typer.Option(help="a simulated world with depth maps; repeat")],
+    validation: Annotated[list[Path], typer.Option(help="such a world, not trained on; repeat")],
+    output: Annotated[Path, typer.Option(help="receives fusion.onnx")] = Path("runs/fusion"),
+    weights: Weights = "default",
+    samples: Annotated[int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")] = 4000,
+    steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Train the network that fuses learned and measured depth; OUTPUT is what depth.fusion of a run takes.
+
+    Example: erfsfm train-fusion --dataset worlds/0 --validation worlds/1 --output runs/fusion
+    """
+    from erfsfm.training.fusion import train_fusion as run_training
+
+    command = shlex.join(["erfsfm", *sys.argv[1:]])
+    with progress_bar() as progress:
+        metrics = run_training(dataset, validation, output, weights, samples, steps, seed, command, progress)
+    print_rows([metrics], as_json)
+    if not as_json:
+        typer.echo(f"network in {output}: use it with --set depth.fusion={output}")
+
+
+def pack(
+    config: Annotated[str, typer.Option(help="of the training: a YAML file, or the name of a shipped configuration")],
+    dataset: Annotated[
+        list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder or video; repeat")
+    ] = None,
+    output: Annotated[Path, typer.Option(help="a new folder, --dataset of the training")] = Path("pack"),
+    shard_megabytes: Annotated[
+        float, typer.Option(min=0.1, help="largest size of a tar file; training needs one for each loader process")
+    ] = 4.0,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="of the JPEG images")] = 85,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+) -> None:
+    """Pack the data of a training for another machine: frames at the networks' size, and what the teacher measured.
+
+    All of it goes to tar files that training reads one after the other, also over HTTP.
+
+    Example: erfsfm pack --config default-gpu --dataset KITTI --dataset worlds --set teacher.cache=labels --output pack
+    """
+    from erfsfm.config import load_experiment
+    from erfsfm.training.pack import pack as run_packing
+
+    experiment = load_experiment(config, list(overrides or [])).with_roots(dataset or [])
+    with progress_bar() as progress:
+        done = run_packing(experiment, output, shard_megabytes, quality, progress)
+    typer.echo(
+        f"{done.size / 1e6:.1f} MB in {output}: {done.shards} shards with {done.frames} frames and {done.labels} labels"
+    )
+    typer.echo(f"train with: erfsfm train --config {config} --dataset {output}")

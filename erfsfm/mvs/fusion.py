@@ -19,7 +19,7 @@ from erfsfm.mvs.refine import SIGMA_FLOOR, RefinedDepth, Road, measure
 
 FILE = "fusion.onnx"
 SHIPPED = Path(__file__).parents[1] / "weights" / "fusion"
-LEVELS = 3  # halvings inside the network
+STEP = 8  # height and width of the network's input are multiples of it
 _MOST_BYTES = 2**26
 _MOST_SIGMA = 2.0
 _THREADS = 1
@@ -62,8 +62,7 @@ class DepthFusion:
         measurement = measure(target, depth, neighbours, K, T_neighbour_target)
         channels = evidence(target, depth, measurement, K)
         h, w = channels.shape[1:]
-        step = 2**LEVELS
-        padded = np.pad(channels, ((0, 0), (0, -h % step), (0, -w % step)), mode="edge")
+        padded = np.pad(channels, ((0, 0), (0, -h % STEP), (0, -w % STEP)), mode="edge")
         change, log_sigma = (
             _at_size(values[0, : 2 * h, : 2 * w], depth.shape)
             for values in self._session.run(["change", "log_sigma"], {"evidence": padded[None]})

@@ -8,26 +8,28 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from erfsfm.mvs.evidence import CHANGE, CHANNELS
-from erfsfm.mvs.fusion import LEVELS
-
 WIDTHS = (16, 32, 64, 96)
+LEVELS = len(WIDTHS) - 1  # halvings inside the network
 _TRUST = 3.0  # of a fresh network in the measurement: its logit
 _UNSURE = -3.0  # logarithm of its sigma
 _LARGEST_CHANGE = 2.0
 
 
 class FusionNet(nn.Module):
-    """Evidence ``(B, CHANNELS, h, w)`` to the change of log inverse depth and the log of its sigma, ``(B, 2h, 2w)``.
+    """Evidence ``(B, channels, h, w)`` to the change of log inverse depth and the log of its sigma, ``(B, 2h, 2w)``.
 
     The change is a mean of the measured one and one of its own, so a trusted measurement keeps its precision. Height
     and width are multiples of ``2 ** LEVELS``.
+
+    Args:
+        channels: of the evidence.
+        measured: the first of the four channels with the measured change.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int, measured: int) -> None:
         super().__init__()
-        assert len(WIDTHS) == LEVELS + 1
-        self.down = nn.ModuleList(nn.Sequential(*_layer(a, b), *_layer(b, b)) for a, b in pairwise((CHANNELS, *WIDTHS)))
+        self._measured = measured
+        self.down = nn.ModuleList(nn.Sequential(*_layer(a, b), *_layer(b, b)) for a, b in pairwise((channels, *WIDTHS)))
         self.narrow = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in pairwise(WIDTHS[::-1]))
         self.up = nn.ModuleList(nn.Sequential(*_layer(width, width)) for width in WIDTHS[-2::-1])
         self.head = nn.Conv2d(WIDTHS[0], 12, 3, padding=1)
@@ -47,7 +49,7 @@ class FusionNet(nn.Module):
             decided = block(larger + kept.pop())
         trust, own, log_sigma = self.head(decided).float().split(4, 1)
         trust = torch.sigmoid(trust)
-        measured = evidence[:, 4 * CHANGE : 4 * CHANGE + 4]
+        measured = evidence[:, self._measured : self._measured + 4]
         change = trust * measured + (1 - trust) * _LARGEST_CHANGE * torch.tanh(own)
         return functional.pixel_shuffle(change, 2)[:, 0], functional.pixel_shuffle(log_sigma, 2)[:, 0]
 

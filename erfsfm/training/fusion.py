@@ -23,8 +23,8 @@ from erfsfm.common.threads import stay_single_threaded
 from erfsfm.data.discovery import discover
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.mvs.evidence import CHANGE, CHANNELS, FULL_SIZE
-from erfsfm.mvs.fusion import FILE, LEVELS
-from erfsfm.networks.fusion_net import FusionNet
+from erfsfm.mvs.fusion import FILE, STEP
+from erfsfm.networks.fusion_net import LEVELS, FusionNet
 from erfsfm.networks.onnx_export import exported
 from erfsfm.training.fusion_samples import FusionSamples, Sample
 
@@ -69,16 +69,15 @@ def train_fusion(
     Raises:
         TrainingError: data without depth or poses.
     """
+    assert STEP == 2**LEVELS, "evidence is padded for another network"
     torch.manual_seed(seed)
     data = _drawn(datasets, weights, samples, seed, progress)
     held_out = _drawn(validation, weights, max(samples // 20, _CHUNK), _VALIDATION_SEED, progress)
-    net = FusionNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    net = FusionNet(CHANNELS, 4 * CHANGE).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     _optimise(net, data, steps, seed, progress)
     net.eval()
     metrics = _fit_sigma(net, held_out)
-    graph = exported(
-        net, [torch.zeros(1, CHANNELS, 2**LEVELS, 2**LEVELS)], ["evidence"], ["change", "log_sigma"], (2, 3)
-    )
+    graph = exported(net, [torch.zeros(1, CHANNELS, STEP, STEP)], ["evidence"], ["change", "log_sigma"], (2, 3))
     output.mkdir(parents=True, exist_ok=True)
     write_atomically(output / FILE, lambda path: path.write_bytes(graph))
     record = {"command": command, "weights": weights, "samples": samples, "steps": steps, "seed": seed, **metrics}

@@ -24,7 +24,7 @@ def test_a_fresh_network_trusts_the_measurement_at_every_pixel() -> None:
     evidence = torch.zeros(1, CHANNELS, 16, 24)
     block = evidence[:, 4 * CHANGE : 4 * CHANGE + 4]
     block[:] = torch.rand(block.shape)
-    change, log_sigma = FusionNet().eval()(evidence)
+    change, log_sigma = FusionNet(CHANNELS, 4 * CHANGE).eval()(evidence)
     measured = torch.nn.functional.pixel_shuffle(block, 2)[:, 0]
     torch.testing.assert_close(change / measured, torch.full_like(measured, torch.sigmoid(torch.tensor(3.0)).item()))
     assert log_sigma.shape == change.shape == (1, 32, 48)
@@ -49,23 +49,12 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(tmp_path: Path, comman
         simulate = ["simulate", str(tmp_path / f"{seed}"), "--seed", str(seed), "--frames", "20", "--route", "grid"]
         subprocess.run([sys.executable, "-m", "slam", *simulate, "--depth"], check=True, capture_output=True)
     roots = ["--dataset", tmp_path / "3", "--validation", tmp_path / "4"]
-    words = [
-        "train-fusion",
-        *roots,
-        "--output",
-        tmp_path / "net",
-        "--weights",
-        "sim",
-        "--samples",
-        "80",
-        "--steps",
-        "20",
-    ]
+    words = ["train-fusion", *roots, "--output", tmp_path / "net", "--weights", "sim", "--samples", 80, "--steps", 20]
     code, out, _ = command_line(main, "erfsfm", *words, "--json")
     (metrics,) = json.loads(out)
     assert code == 0 and metrics["fused_mean"] < metrics["guess_mean"]
-    run = ["run", "--dataset", tmp_path / "4", "--weights", "sim", "--set", f"depth.fusion={tmp_path / 'net'}"]
-    done = subprocess.run([sys.executable, "-m", "slam", *run, "--output", tmp_path / "run"], capture_output=True)
+    run = ["run", "--dataset", str(tmp_path / "4"), "--weights", "sim", "--set", f"depth.fusion={tmp_path / 'net'}"]
+    done = subprocess.run([sys.executable, "-m", "slam", *run, "--output", str(tmp_path / "run")], capture_output=True)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["depth"]["refined"]["median_rel"] < 0.5
 

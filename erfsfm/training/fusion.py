@@ -67,10 +67,15 @@ def train_fusion(
         progress: is told.
 
     Raises:
-        TrainingError: data without depth or poses.
+        TrainingError: data without depth or poses, or a file of another program in the way.
     """
     assert STEP == 2**LEVELS, "evidence is padded for another network"
     torch.manual_seed(seed)
+    if (output / FILE).exists() and not (output / RECORD).exists():
+        raise TrainingError(
+            f"{output / FILE} is not of erfsfm train-fusion and would be replaced: choose another --output"
+        )
+    output.mkdir(parents=True, exist_ok=True)
     data = _drawn(datasets, weights, samples, seed, progress)
     held_out = _drawn(validation, weights, max(samples // 20, _CHUNK), _VALIDATION_SEED, progress)
     net = FusionNet(CHANNELS, 4 * CHANGE).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -78,7 +83,6 @@ def train_fusion(
     net.eval()
     metrics = _fit_sigma(net, held_out)
     graph = exported(net, [torch.zeros(1, CHANNELS, STEP, STEP)], ["evidence"], ["change", "log_sigma"], (2, 3))
-    output.mkdir(parents=True, exist_ok=True)
     write_atomically(output / FILE, lambda path: path.write_bytes(graph))
     record = {"command": command, "weights": weights, "samples": samples, "steps": steps, "seed": seed, **metrics}
     write_atomically(output / RECORD, lambda path: path.write_text(json.dumps(record, indent=2) + "\n"))

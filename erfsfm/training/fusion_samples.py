@@ -29,6 +29,14 @@ _WEATHER = 0.4
 _SCALE_SPREAD = 0.04
 _TURN_ERROR_DEG = 0.02
 _LENGTH_ERROR = 0.01
+_LEAST_KNOWN = 0.3  # of the pixels of a frame
+_MOST_TRIES = 200  # frames until one has depth and neighbours
+
+
+_WANTED = (
+    f"the fusion network is trained on simulated drives of at least {WIDTH}x{2 * CROP[0]} in shape; make some by "
+    "erfsfm-slam simulate W --depth"
+)
 
 
 class Sample(NamedTuple):
@@ -48,30 +56,37 @@ class FusionSamples:
     def __init__(self, recordings: Sequence[Recording], networks: DepthPosePredictor, seed: int) -> None:
         posed = [(r, poses) for r in recordings if r.depth is not None and (poses := r.true_poses()) is not None]
         if not posed:
+            raise TrainingError(f"no drive has depth maps and poses: {_WANTED}")
+        flat = [r for r, _ in posed if _height(r) < 2 * CROP[0]]
+        if flat:
             raise TrainingError(
-                "the fusion network is trained on drives with depth maps and poses; make some by "
-                "erfsfm-slam simulate W --depth"
+                f"{flat[0].name} has images of {flat[0].camera.width} x {flat[0].camera.height}: {_WANTED}"
             )
         self._recordings, self._poses = zip(*posed, strict=True)
         self._networks, self._rng = networks, np.random.default_rng(seed)
 
     def draw(self) -> Sample:
-        """Of a random crop of a random frame."""
-        while True:
+        """Of a random crop of a random frame.
+
+        Raises:
+            TrainingError: no frame has depth and neighbours.
+        """
+        for _ in range(_MOST_TRIES):
             which = int(self._rng.integers(len(self._recordings)))
             index = int(self._rng.integers(len(self._recordings[which])))
             truth = self._recordings[which].true_depth(index)
-            if truth is not None and (truth > 0).mean() > 0.3:
+            if truth is not None and (truth > 0).mean() > _LEAST_KNOWN:
                 drawn = self._sample(self._recordings[which], self._poses[which], index, truth)
                 if drawn is not None:
                     return drawn
+        raise TrainingError(f"no frame has dense depth and others at a useful distance: {_WANTED}")
 
     def _sample(
         self, recording: Recording, T_world_camera: NDArray[np.float64], index: int, truth: Array
     ) -> Sample | None:
         rng = self._rng
         camera = recording.camera
-        height = round(camera.height * WIDTH / camera.width)
+        height = _height(recording)
         size = (WIDTH, height)
         truth = np.asarray(cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT))
         chosen = self._neighbours(T_world_camera, index, float(np.median(truth[truth > 0])))
@@ -130,6 +145,11 @@ class FusionSamples:
         at = slice(2 * top, 2 * (top + h)), slice(2 * left, 2 * (left + w))
         part = channels[:, top : top + h, left : left + w]
         return Sample(part.astype(np.float16), wanted[at].astype(np.float16), is_known[at])
+
+
+def _height(recording: Recording) -> int:
+    """Of its images at ``WIDTH``."""
+    return round(recording.camera.height * WIDTH / recording.camera.width)
 
 
 def _recorded(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -6,9 +6,8 @@ Nothing in it has a unit: depth is relative to the median of the image, so one n
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from erfsfm.mvs.appearance import Appearance, Array
+from erfsfm.mvs.appearance import Array
 from erfsfm.mvs.refine import Measurement
 from erfsfm.mvs.semi_global import UNIT, Costs
 from erfsfm.mvs.sweep import CHANGES, lowest
@@ -23,21 +22,15 @@ _LEAST_INFORMATION = 1e-2
 _MOST = 4.0  # of a channel
 
 
-def evidence(target: Appearance, depth: Array, measurement: Measurement, K: NDArray[np.floating]) -> Array:
-    """Channels ``(CHANNELS, h, w)`` at half size, rounded down.
-
-    Args:
-        target: the image, ``(H, W)``.
-        depth: its learned z-depth ``(H, W)``.
-        measurement: of its neighbours.
-        K: its camera matrix ``(3, 3)``.
-    """
+def evidence(measurement: Measurement) -> Array:
+    """Channels ``(CHANNELS, h, w)`` of a measurement at half size, rounded down."""
+    depth, K = measurement.depth, measurement.K
     height, width = depth.shape
     h, w = height // 2, width // 2
     nearness = np.log(np.median(depth) / depth)
     y = (np.arange(height, dtype=np.float32)[:, None] - np.float32(K[1, 2])) / np.float32(K[1, 1])
     full = (
-        target.levels,
+        measurement.target.levels,
         nearness,
         measurement.change,
         measurement.fit,

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from onnxruntime import InferenceSession
 
 from erfsfm.common.errors import CheckpointError
 from erfsfm.common.files import read_bytes
 from erfsfm.common.onnx_session import open_session
-from erfsfm.mvs.appearance import Appearance, Array
+from erfsfm.mvs.appearance import Array
 from erfsfm.mvs.evidence import CHANNELS, evidence
-from erfsfm.mvs.refine import SIGMA_FLOOR, RefinedDepth, Road, measure
+from erfsfm.mvs.refine import SIGMA_FLOOR, Measurement, RefinedDepth, Road
 
 FILE = "fusion.onnx"
 SHIPPED = Path(__file__).parents[1] / "weights" / "fusion"
@@ -49,18 +47,9 @@ class DepthFusion:
                 f"{path} is not a network of erfsfm train-fusion, or of another version: train it again"
             )
 
-    def refine(
-        self,
-        target: Appearance,
-        depth: Array,
-        neighbours: Sequence[Appearance],
-        K: NDArray[np.floating],
-        T_neighbour_target: NDArray[np.float64],
-        road: Road | None = None,
-    ) -> RefinedDepth:
-        """As `erfsfm.mvs.refine.refine`; the network finds by itself what moves, and needs no road."""
-        measurement = measure(target, depth, neighbours, K, T_neighbour_target)
-        channels = evidence(target, depth, measurement, K)
+    def decide(self, measurement: Measurement, road: Road | None = None) -> RefinedDepth:
+        """As `erfsfm.mvs.refine.by_rules`; the network finds by itself what moves, and needs no road."""
+        depth, channels = measurement.depth, evidence(measurement)
         h, w = channels.shape[1:]
         padded = np.pad(channels, ((0, 0), (0, -h % STEP), (0, -w % STEP)), mode="edge")
         change, log_sigma = (

@@ -6,7 +6,7 @@ to full size along the edges of the image and sharpened by Gauss-Newton steps on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -52,10 +52,14 @@ class RefinedDepth:
 class Measurement:
     """What the neighbours of an image say about its depth.
 
-    ``change`` of log inverse depth ``(H, W)``, the ``information`` on it, and the ``fit``, the neighbours' mean weight;
-    ``costs`` of the plane sweep ``(C, h, w)`` at half size, and the ``coarse`` change ``(h, w)`` by smoothed ones.
+    Of the ``target``, its learned z-depth ``(H, W)`` and its camera matrix ``(3, 3)``: the ``change`` of log inverse
+    depth ``(H, W)``, the ``information`` on it, and the ``fit``, the neighbours' mean weight; ``costs`` of the plane
+    sweep ``(C, h, w)`` at half size, and the ``coarse`` change ``(h, w)`` by smoothed ones.
     """
 
+    target: Appearance
+    depth: Array
+    K: NDArray[np.floating]
     change: Array
     information: Array
     fit: Array
@@ -68,35 +72,7 @@ class Measurement:
         return (self.information > 1 / LEAST_PRIOR_SIGMA**2) & (self.fit >= LEAST_FIT)
 
 
-def refine(
-    target: Appearance,
-    depth: Array,
-    neighbours: Sequence[Appearance],
-    K: NDArray[np.floating],
-    T_neighbour_target: NDArray[np.float64],
-    road: Road | None = None,
-) -> RefinedDepth:
-    """Refine the depth of an image, by rules.
-
-    Args:
-        target: the image, ``(H, W)``.
-        depth: its learned z-depth ``(H, W)``, positive.
-        neighbours: N images of the same camera.
-        K: camera matrix ``(3, 3)`` of these images.
-        T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
-        road: below which nothing static is seen: what seems to lie there moves with the camera and keeps the prior.
-    """
-    measurement = measure(target, depth, neighbours, K, T_neighbour_target)
-    change, measured = measurement.change, measurement.measured
-    change[measurement.fit < LEAST_FIT] = 0
-    if road is not None:
-        moving = _under_road(depth * np.exp(-change), K, road) & ~_under_road(depth, K, road)
-        moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        change[moving], measured[moving] = 0, False
-    prior_sigma = max(LEAST_PRIOR_SIGMA, 1.48 * float(np.median(np.abs(change[measured])))) if measured.any() else 1.0
-    known = np.where(measured, measurement.information, 0) + 1 / prior_sigma**2
-    sigma = np.sqrt(1 / known + SIGMA_FLOOR**2)
-    return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma.astype(np.float32), measured)
+Decide = Callable[[Measurement, Road | None], RefinedDepth]
 
 
 def measure(
@@ -106,32 +82,47 @@ def measure(
     K: NDArray[np.floating],
     T_neighbour_target: NDArray[np.float64],
 ) -> Measurement:
-    """Compare an image with its neighbours around its learned depth; arguments as of `refine`."""
-    height, width = depth.shape
+    """Compare an image with its neighbours around its learned depth.
+
+    Args:
+        target: the image, ``(H, W)``.
+        depth: its learned z-depth ``(H, W)``, positive.
+        neighbours: N images of the same camera.
+        K: camera matrix ``(3, 3)`` of these images.
+        T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
+    """
+    (height, width), (h, w) = depth.shape, target.coarse.shape
     inverse = (1 / depth).astype(np.float32)
-    costs = _costs(target, inverse, neighbours, K, T_neighbour_target)
+    small = np.asarray(cv2.resize(inverse, (w, h), interpolation=cv2.INTER_AREA), np.float32)
+    pairs = list(zip(neighbours, T_neighbour_target))
+    costs = sweep(target.coarse, [(other.coarse, Projection(halved(K), T, h, w)) for other, T in pairs], small)
     coarse = lowest(smoothed(costs, target.coarse_grey))
     change = _enlarged(np.asarray(cv2.medianBlur(coarse, 5), np.float32), target)
-    views = [(other, Projection(K, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
+    views = [(other, Projection(K, T, height, width)) for other, T in pairs]
     for _ in range(STEPS):
         step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step
-    return Measurement(change, information, fit, costs, coarse)
+    return Measurement(target, depth, K, change, information, fit, costs, coarse)
 
 
-def _costs(
-    target: Appearance,
-    inverse: Array,
-    neighbours: Sequence[Appearance],
-    K: NDArray[np.floating],
-    T_neighbour_target: NDArray[np.float64],
-) -> Costs:
-    """Of each change of log inverse depth, ``(C, h, w)`` at half size."""
-    height, width = target.coarse.shape
-    small = np.asarray(cv2.resize(inverse, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-    K_half = halved(K)
-    views = [(other.coarse, Projection(K_half, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
-    return sweep(target.coarse, views, small)
+def by_rules(measurement: Measurement, road: Road | None) -> RefinedDepth:
+    """The measured depth, and the learned one where no depth explains the neighbours.
+
+    Args:
+        measurement: of an image.
+        road: below which nothing static is seen: what seems to lie there moves with the camera and keeps the prior.
+    """
+    depth, K = measurement.depth, measurement.K
+    measured = measurement.measured
+    change = np.where(measurement.fit < LEAST_FIT, np.float32(0), measurement.change)
+    if road is not None:
+        moving = _under_road(depth * np.exp(-change), K, road) & ~_under_road(depth, K, road)
+        moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        change[moving], measured[moving] = 0, False
+    prior_sigma = max(LEAST_PRIOR_SIGMA, 1.48 * float(np.median(np.abs(change[measured])))) if measured.any() else 1.0
+    known = np.where(measured, measurement.information, 0) + 1 / prior_sigma**2
+    sigma = np.sqrt(1 / known + SIGMA_FLOOR**2)
+    return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma.astype(np.float32), measured)
 
 
 def _enlarged(change: Array, target: Appearance) -> Array:

@@ -32,7 +32,6 @@ _LENGTH_ERROR = 0.01
 _LEAST_KNOWN = 0.3  # of the pixels of a frame
 _MOST_TRIES = 200  # frames until one has depth and neighbours
 
-
 _WANTED = (
     f"the fusion network is trained on simulated drives of at least {WIDTH}x{2 * CROP[0]} in shape; make some by "
     "erfsfm-slam simulate W --depth"
@@ -103,7 +102,7 @@ class FusionSamples:
             T[:3, :3] = T[:3, :3] @ turn
             T[:3, 3] *= 1 + rng.normal(0, _LENGTH_ERROR)
         K = camera.resized(WIDTH, height).K.astype(np.float64)
-        channels = evidence(target, guess, measure(target, guess, others, K, T_neighbour_target), K)
+        channels = evidence(measure(target, guess, others, K, T_neighbour_target))
         is_known = truth > 0
         return self._cropped(channels, np.log(guess / np.where(is_known, truth, FARTHEST_M)), is_known)
 

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.refine import RefinedDepth, Road, refine
+from erfsfm.mvs.refine import Decide, RefinedDepth, Road, by_rules, measure
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
@@ -24,21 +24,15 @@ MAX_ROTATION_DEG = 20.0
 _REMEMBERED = 24
 
 
-Refine = Callable[..., RefinedDepth]  # as `erfsfm.mvs.refine.refine`
-
-
-def refinement(config: DepthConfig) -> Refine | None:
-    """How depth is refined; None where it stays as it is.
+def decision(config: DepthConfig) -> Decide | None:
+    """What decides between learned and measured depth; None where depth is not refined.
 
     Raises:
         CheckpointError: ``config.fusion`` names no network that can be read.
     """
-    by: dict[str, Callable[[], Refine | None]] = {
-        "none": lambda: None,
-        "multiview": lambda: refine,
-        "learned": lambda: DepthFusion(config.fusion).refine,
-    }
-    return by[config.refine]()
+    if config.refine == "learned":
+        return DepthFusion(config.fusion).decide
+    return by_rules if config.refine == "multiview" else None
 
 
 class DepthRefiner:
@@ -50,7 +44,7 @@ class DepthRefiner:
         indices: Sequence[int],
         T_world_camera: FloatArray,
         image: Callable[[int], Image],
-        refine: Refine = refine,
+        decide: Decide = by_rules,
     ) -> None:
         """Prepare.
 
@@ -59,12 +53,12 @@ class DepthRefiner:
             indices: frame numbers of the K keyframes, ascending.
             T_world_camera: their poses ``(K, 4, 4)``, in the unit of the depths to come.
             image: the n-th keyframe's image ``(H, W, 3)``.
-            refine: of `refinement`.
+            decide: of `decision`.
         """
         self._intrinsics = intrinsics
         self._indices = np.asarray(indices)
         self._T_world_camera = T_world_camera
-        self._refine = refine
+        self._decide = decide
         self._appearance = lru_cache(maxsize=_REMEMBERED)(lambda n: _appearance(image(n)))
 
     def refine(self, n: int, depth: DepthMap, road: Road | None) -> RefinedDepth | None:
@@ -84,7 +78,8 @@ class DepthRefiner:
             depth = depth[tuple(nearest)]
         T_neighbour_target = invert(self._T_world_camera[neighbours]) @ self._T_world_camera[n]
         others = [self._appearance(k) for k in neighbours]
-        refined = self._refine(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target, road)
+        measurement = measure(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target)
+        refined = self._decide(measurement, road)
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
         return refined
 

@@ -10,6 +10,7 @@ from functools import cached_property, partial
 from pathlib import Path
 
 from erfsfm.common.progress import Progress, silent
+from erfsfm.mvs.refine import Decide
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
@@ -33,7 +34,7 @@ from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
-from slam.mapping.depth_refinement import Refine, refinement
+from slam.mapping.depth_refinement import decision
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
@@ -247,7 +248,7 @@ class SlamPipeline:
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
         scales, error = estimate.scale.per_frame, estimate.state.odometry.depth_error
-        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, self._refine)
+        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, self._decide)
         mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
         selected = tsdf_map.select([keyframe.index for keyframe in keyframes], T_world_camera)
@@ -265,12 +266,12 @@ class SlamPipeline:
         shortest = self._predictor.sources + 1
         require_possible(self._sequence, self._config, shortest, self._gps_track is not None)
         _ = self._positioning
-        _ = self._refine
+        _ = self._decide
 
     @cached_property
-    def _refine(self) -> Refine | None:
-        """Of the map's keyframes."""
-        return refinement(self._config.depth) if self._config.mapping.enabled else None
+    def _decide(self) -> Decide | None:
+        """Between learned and measured depth of the map's keyframes."""
+        return decision(self._config.depth) if self._config.mapping.enabled else None
 
     @cached_property
     def _positioning(self) -> Positioning | None:

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from erfsfm.mvs.refine import Road
+from erfsfm.mvs.refine import Decide, Road
 from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
-from slam.mapping.depth_refinement import DepthRefiner, Refine
+from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.filters import KeyframeDepth
 
 _SOME = 20
@@ -30,7 +30,7 @@ class KeyframeDepths:
         T_world_camera: FloatArray,
         error: DepthError,
         intrinsics: Intrinsics,
-        refine: Refine | None,
+        decide: Decide | None,
     ) -> None:
         """Prepare.
 
@@ -40,16 +40,16 @@ class KeyframeDepths:
             T_world_camera: poses of all frames ``(N, 4, 4)``.
             error: of learned depth on this drive, taken out before depth is refined or fused.
             intrinsics: of the keyframes.
-            refine: how; None where depth stays as it is.
+            decide: between learned and measured depth; None where it is not refined.
         """
         self._keyframes: Sequence[Keyframe] = drive.keyframes
         self._roads = drive.roads
         self._scale, self._T_world_camera, self._error = scale_per_frame, T_world_camera, error
         self._refiner: DepthRefiner | None = None
-        if refine is not None:
+        if decide is not None:
             indices = [keyframe.index for keyframe in self._keyframes]
             self._refiner = DepthRefiner(
-                intrinsics, indices, T_world_camera[indices], lambda n: self._keyframes[n].image, refine
+                intrinsics, indices, T_world_camera[indices], lambda n: self._keyframes[n].image, decide
             )
 
     def fitted(self, mapping: MappingConfig) -> MappingConfig:

@@ -18,7 +18,6 @@ class TrackedFrame:
     track_ids: TrackIds
     pixels: Pixels
     T_camera_world: FloatArray | None
-    keyframe: int  # the last one, by its place among the map's
 
 
 @dataclass

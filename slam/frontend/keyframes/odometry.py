@@ -124,7 +124,7 @@ class KeyframeOdometry:
         state.T_camera_world, state.T_last_step, state.lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
         pixels = in_middle_row(pixels, state.turn, self._intrinsics)
-        segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
+        segment.frames.append(self._tracked(frame, track_ids, pixels))
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
@@ -190,11 +190,11 @@ class KeyframeOdometry:
         """The first points, once the parallax to one of the keyframes gives them; else another keyframe in time."""
         local, last = segment.map, segment.map.keyframes[-1]
         places, pixels = pixels, in_middle_row(pixels, self._state.turn, self._intrinsics)
-        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, 0))
+        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None))
         for first in local.keyframes:
             if self._started(segment, first, track_ids, pixels):
                 self._add_keyframe(segment, frame, track_ids, places)
-                segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
+                segment.frames[-1] = self._tracked(frame, track_ids, pixels)
                 return
         self._keep_turn(turn_since(last, frame.index, track_ids, pixels, self._intrinsics))
         if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), _LEAST_START_TRACKS):
@@ -241,7 +241,7 @@ class KeyframeOdometry:
         if pose is None:
             state.lost += 1
             state.T_last_step = np.eye(4)
-            segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, len(segment.map.keyframes) - 1))
+            segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None))
             self._keep_turn(turn_since(segment.map.keyframes[-1], frame.index, track_ids, pixels, self._intrinsics))
             if (state.lost + 1) * since > _MAX_LOST_S:
                 self._begin(frame)
@@ -255,7 +255,7 @@ class KeyframeOdometry:
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
         if self._wants_keyframe(segment, track_ids, pixels):
             self._add_keyframe(segment, frame, track_ids, places)
-        segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
+        segment.frames.append(self._tracked(frame, track_ids, pixels))
 
     def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
         """From the last pose and from the predicted one; None with too few inliers."""
@@ -333,9 +333,8 @@ class KeyframeOdometry:
         self._state.events.append(TrackingEvent(frame, event, other, support))
         logger.info("%s", self._state.events[-1])
 
-    def _tracked(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
-        last = len(segment.map.keyframes) - 1
-        return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world, last)
+    def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
+        return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world)
 
 
 def _spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 import pytest
 
 from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.refine import RefinedDepth, Road, refine
+from erfsfm.mvs.refine import Decide, RefinedDepth, Road, by_rules, measure
 
 H, W = 96, 240
 K = np.array([[150.0, 0.0, 119.5], [0.0, 150.0, 47.5], [0.0, 0.0, 1.0]])
@@ -59,21 +57,21 @@ def refined(
     images: list[np.ndarray],
     prior: np.ndarray,
     road: Road | None = None,
-    by: Callable[..., RefinedDepth] = refine,
+    by: Decide = by_rules,
     unit: float = 1.0,
 ) -> RefinedDepth:
     """The first image, refined by the others at ``POSITIONS``; a metre is so many units."""
     T = np.tile(np.eye(4), (len(POSITIONS), 1, 1))
     T[:, :3, 3] = -unit * np.array(POSITIONS)
     target, *others = (Appearance.of(image) for image in images)
-    return by(target, (unit * prior).astype(np.float32), others, K, T, road)
+    return by(measure(target, (unit * prior).astype(np.float32), others, K, T), road)
 
 
-BOTH = pytest.mark.parametrize("by", [refine, DepthFusion("default").refine], ids=["rules", "network"])
+BOTH = pytest.mark.parametrize("by", [by_rules, DepthFusion("default").decide], ids=["rules", "network"])
 
 
 @BOTH
-def test_a_wall_and_a_step_are_found_from_a_wrong_guess(by: Callable[..., RefinedDepth]) -> None:
+def test_a_wall_and_a_step_are_found_from_a_wrong_guess(by: Decide) -> None:
     images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     truth = wall_and_step((0.0, 0.0, 0.0))[1]
     found = refined(images, np.full((H, W), 9.0), by=by)
@@ -135,7 +133,7 @@ def test_a_car_that_drives_ahead_keeps_the_guess(guess: float) -> None:
 
 
 @BOTH
-def test_the_unit_of_length_does_not_matter(by: Callable[..., RefinedDepth]) -> None:
+def test_the_unit_of_length_does_not_matter(by: Decide) -> None:
     images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     metres, feet = (refined(images, np.full((H, W), 9.0), by=by, unit=unit) for unit in (1.0, 1 / 0.3048))
     np.testing.assert_allclose(np.median(feet.depth * 0.3048 / metres.depth), 1, atol=1e-4)
@@ -143,7 +141,7 @@ def test_the_unit_of_length_does_not_matter(by: Callable[..., RefinedDepth]) -> 
 
 
 @BOTH
-def test_sizes_that_are_odd(by: Callable[..., RefinedDepth]) -> None:
+def test_sizes_that_are_odd(by: Decide) -> None:
     images = [wall_and_step(position)[0][:-1, :-1] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     found = refined(images, np.full((H - 1, W - 1), 9.0), by=by)
     assert found.depth.shape == found.relative_sigma.shape == (H - 1, W - 1)

@@ -6,12 +6,9 @@ All of it is kept in a folder under a digest of the drive's images and camera, s
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
-import os
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,9 +21,10 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import DataError, TrainingError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.lock import FolderLock
+from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
-from erfsfm.common.threads import limit_library_threads, stay_single_threaded
+from erfsfm.common.threads import limit_library_threads
 from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
@@ -261,19 +259,13 @@ class ManyViewTeacher:
             with limit_library_threads():
                 progress("teacher: depth", drive.measure_labels(chunk), total)
             return
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:
+        with processes("measures labels") as pool:
             running: list[Future[int]] = [
                 pool.submit(drive.measure_labels, chunk, self._guess) for drive, chunk in tasks
             ]
-            try:
-                for future in as_completed(running):
-                    done += future.result()
-                    progress("teacher: depth", done, total)
-            except BrokenProcessPool as error:
-                raise TrainingError("a process that measures labels was killed: is there enough memory?") from error
-            finally:
-                pool.shutdown(cancel_futures=True)
+            for future in as_completed(running):
+                done += future.result()
+                progress("teacher: depth", done, total)
 
     def _digest(self, recording: Recording) -> str:
         """Of the images, the camera, and the version of this file; kept by names, sizes and times of the images."""

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -18,8 +15,8 @@ from torch.nn import functional
 
 from erfsfm.common.errors import TrainingError
 from erfsfm.common.files import write_atomically
+from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
-from erfsfm.common.threads import stay_single_threaded
 from erfsfm.data.discovery import discover
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.mvs.evidence import CHANGE, CHANNELS, FULL_SIZE
@@ -93,8 +90,7 @@ def _drawn(roots: Sequence[Path], weights: str, count: int, seed: int, progress:
     """Samples of worlds, by as many processes as there are cores; the same for any number of them."""
     chunks = [seed * 10**4 + n for n in range(math.ceil(count / _CHUNK))]
     drawn: list[Sample] = []
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:
+    with processes("draws evidence") as pool:
         for part in pool.map(partial(_chunk, tuple(roots), weights), chunks):
             drawn += part
             progress("evidence", min(len(drawn), count), count)

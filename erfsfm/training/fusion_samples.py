@@ -16,14 +16,13 @@ from erfsfm.data.weather import weathered
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.evidence import evidence
+from erfsfm.mvs.neighbours import BASELINES, neighbours
 from erfsfm.mvs.refine import measure
 
 WIDTH = 416
 CROP = (64, 144)  # of the evidence
-_BASELINES = (0.07, 0.2, -0.07)  # over the median depth; a negative one lies before the image
+_BASELINES = (*BASELINES, -BASELINES[0])  # as a run has them mostly
 _BASELINE_SPREAD = 0.4
-_BASELINE_RANGE = np.log(2.5)
-_LARGEST_TURN_DEG = 20.0
 _LEFT_OUT = 0.1  # chance of each neighbour
 _WEATHER = 0.4
 _SCALE_SPREAD = 0.04
@@ -88,7 +87,9 @@ class FusionSamples:
         height = _height(recording)
         size = (WIDTH, height)
         truth = np.asarray(cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT))
-        chosen = self._neighbours(T_world_camera, index, float(np.median(truth[truth > 0])))
+        baselines = np.multiply(_BASELINES, np.exp(rng.normal(0, _BASELINE_SPREAD, len(_BASELINES))))
+        chosen = neighbours(T_world_camera, index, baselines * np.median(truth[truth > 0]))
+        chosen = [n for n in chosen if rng.random() > _LEFT_OUT]
         if not chosen:
             return None
         images = [recording.image(n, height, WIDTH) for n in (index, *chosen)]
@@ -105,24 +106,6 @@ class FusionSamples:
         channels = evidence(measure(target, guess, others, K, T_neighbour_target))
         is_known = truth > 0
         return self._cropped(channels, np.log(guess / np.where(is_known, truth, FARTHEST_M)), is_known)
-
-    def _neighbours(self, T_world_camera: NDArray[np.float64], index: int, median_depth: float) -> list[int]:
-        """Frames about as far away as a run would choose its keyframes."""
-        rng = self._rng
-        T_target_other = np.linalg.inv(T_world_camera[index]) @ T_world_camera
-        distance = np.linalg.norm(T_target_other[:, :3, 3], axis=1) / median_depth
-        cosine = (np.trace(T_target_other[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-        turned = np.arccos(np.clip(cosine, -1, 1)) > np.deg2rad(_LARGEST_TURN_DEG)
-        numbers = np.arange(len(distance))
-        chosen: list[int] = []
-        for baseline in _BASELINES:
-            wanted = abs(baseline) * np.exp(rng.normal(0, _BASELINE_SPREAD))
-            off = np.abs(np.log(np.maximum(distance, 1e-9) / wanted))
-            off[turned | (off > _BASELINE_RANGE) | ((numbers > index) != (baseline > 0))] = np.inf
-            best = int(off.argmin())
-            if np.isfinite(off[best]) and best not in chosen and rng.random() > _LEFT_OUT:
-                chosen.append(best)
-        return chosen
 
     def _guess(self, image: NDArray[np.uint8], truth: Array) -> Array:
         """Learned depth with an error of its unit; often bent or blurred, as that of networks on unknown streets."""

@@ -11,16 +11,14 @@ from scipy.ndimage import distance_transform_edt
 
 from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
+from erfsfm.mvs.neighbours import BASELINES, neighbours
 from erfsfm.mvs.refine import Decide, RefinedDepth, Road, by_rules, measure
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Image, Intrinsics
-from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.geometry.se3 import FloatArray, invert
 
-BASELINES = (0.07, 0.2)  # wanted distances of neighbours over the median depth, after the keyframe and before it
-BASELINE_RANGE = 2.5  # accepted factor on these
 MOST_NEIGHBOURS = 3
 MAX_FRAMES_APART = 40
-MAX_ROTATION_DEG = 20.0
 _REMEMBERED = 24
 
 
@@ -70,14 +68,14 @@ class DepthRefiner:
         unknown = ~(np.isfinite(depth) & (depth > 0))
         if unknown.all():
             return None
-        neighbours = self._neighbours(n, float(np.median(depth[~unknown])))
-        if not neighbours:
+        chosen = self._neighbours(n, float(np.median(depth[~unknown])))
+        if not chosen:
             return None
         if unknown.any():
             nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
             depth = depth[tuple(nearest)]
-        T_neighbour_target = invert(self._T_world_camera[neighbours]) @ self._T_world_camera[n]
-        others = [self._appearance(k) for k in neighbours]
+        T_neighbour_target = invert(self._T_world_camera[chosen]) @ self._T_world_camera[n]
+        others = [self._appearance(k) for k in chosen]
         measurement = measure(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target)
         refined = self._decide(measurement, road)
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
@@ -86,18 +84,9 @@ class DepthRefiner:
     def _neighbours(self, n: int, median_depth: float) -> list[int]:
         """The best keyframe at each wanted distance, at most three; those after are nearer to what is ahead."""
         near = np.flatnonzero(np.abs(self._indices - self._indices[n]) <= MAX_FRAMES_APART)
-        T_target_other = invert(self._T_world_camera[n]) @ self._T_world_camera[near]
-        distance = np.linalg.norm(T_target_other[:, :3, 3], axis=1)
-        turned = rotation_angle(T_target_other[:, :3, :3])
-        chosen: list[int] = []
-        for side in (near > n, near < n):
-            for baseline in BASELINES:
-                off = np.abs(np.log(np.maximum(distance, 1e-9) / (baseline * median_depth)))
-                usable = side & (off < np.log(BASELINE_RANGE)) & (turned < np.deg2rad(MAX_ROTATION_DEG))
-                usable &= ~np.isin(near, chosen)
-                if usable.any():
-                    chosen.append(int(near[np.where(usable, off, np.inf).argmin()]))
-        return sorted(chosen[:MOST_NEIGHBOURS])
+        wanted = [sign * baseline * median_depth for sign in (1, -1) for baseline in BASELINES]
+        chosen = neighbours(self._T_world_camera[near], n - int(near[0]), wanted)
+        return sorted(int(near[row]) for row in chosen[:MOST_NEIGHBOURS])
 
 
 def _appearance(image: Image) -> Appearance:

@@ -16,7 +16,8 @@ from slam.frontend.keyframes.flow import new_corners
 from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
-from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses, learned_unit
+from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
+from slam.frontend.keyframes.unit import evened, learned_unit
 from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
@@ -156,7 +157,7 @@ class KeyframeTracking:
 
     def poses(self, maps: Sequence[MapSegment]) -> KeyframePoses:
         """Relative poses of all frames of some maps."""
-        return keyframe_poses(maps, self._intrinsics, self._seed)
+        return keyframe_poses([evened(each, self._intrinsics) for each in maps], self._intrinsics, self._seed)
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
+from slam.frontend.keyframes.local_map import TrackIds
+from slam.frontend.keyframes.map_segment import TrackedFrame
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
@@ -26,6 +28,7 @@ from slam.frontend.visual.epipolar import (
 )
 from slam.geometry.se3 import FloatArray, make, rotation_angle
 
+_BETWEEN = 3  # number of frames between the two views that become keyframes too
 _LEAST_POINTS = 40
 _LEAST_RATIO = 0.5
 _INLIER_PX = 1.0
@@ -116,3 +119,15 @@ def _alike(one: UnitRelativePose, other: UnitRelativePose) -> bool:
     turned = rotation_angle(one.R_current_previous @ other.R_current_previous.T)
     apart = np.arccos(np.clip(one.direction @ other.direction, -1.0, 1.0))
     return bool(turned < _SAME_MOTION and apart < 4.0 * _SAME_MOTION)
+
+
+def spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:
+    """Some of these frames, evenly spread, neither the first nor the last."""
+    chosen = np.linspace(0, len(frames) - 1, _BETWEEN + 2).astype(int)[1:-1]
+    return [frames[row] for row in np.unique(chosen) if frames]
+
+
+def view_of(track_ids: TrackIds, frame: TrackedFrame) -> View:
+    """Rows of those corners that a frame sees, and their pixels there."""
+    _, rows, seen = np.intersect1d(track_ids, frame.track_ids, assume_unique=True, return_indices=True)
+    return rows, frame.pixels[seen]

@@ -24,7 +24,8 @@ class TrackedFrame:
 class MapSegment:
     """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points.
 
-    ``turns`` are rotations of the camera where it has no points, before the first or after the last; lengths in depths.
+    ``turns`` are motions of the camera where it has no points, before the first or after the last, in the unit of
+    learned depth.
     """
 
     map: LocalMap = field(default_factory=LocalMap)

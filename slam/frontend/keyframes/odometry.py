@@ -19,11 +19,11 @@ from slam.frames import DepthMap, Event, Frame, Intrinsics, RelativePose, Tracki
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import SURE_RESPONSE, Thumbnail, flow, image_shift, new_corners
-from slam.frontend.keyframes.initialisation import View, first_points
+from slam.frontend.keyframes.initialisation import first_points, spread, view_of
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
-from slam.frontend.keyframes.turns import is_turn, rotation_and_parallax, turn_by_shift, turn_since
+from slam.frontend.keyframes.turns import is_turn, motion_since, rotation_and_parallax, turn_by_shift
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
 from slam.geometry.se3 import FloatArray, invert
@@ -31,7 +31,6 @@ from slam.geometry.se3 import FloatArray, invert
 logger = logging.getLogger(__name__)
 
 _LEAST_START_TRACKS = 60
-_START_KEYFRAMES = 3
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
@@ -53,6 +52,7 @@ class KeyframeOdometryState:
     T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
     lost: int = 0
     stamp: float = 0.0
+    learned_depth: float = 1.0  # median of the last image that has one
     turn: FloatArray = field(default_factory=lambda: np.zeros(3))  # a second, where the shutter rolls
     thumbnail: Thumbnail = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
@@ -136,7 +136,8 @@ class KeyframeOdometry:
         track_ids, pixels = self._track(segment, frame, shift)
         self._measure_turn(segment, track_ids, pixels, since)
         if len(track_ids) < MIN_POINTS and response > SURE_RESPONSE:
-            self._keep_turn(turn_by_shift(segment.last_tracked, frame.index, shift, self._intrinsics))
+            depth = self._state.learned_depth
+            self._keep_turn(turn_by_shift(segment.last_tracked, frame.index, shift, depth, self._intrinsics))
         if segment.started:
             self._locate(segment, frame, track_ids, pixels, since)
         else:
@@ -144,6 +145,7 @@ class KeyframeOdometry:
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
+        self._state.learned_depth = float(np.nanmedian(depth))
         keyframes = self._state.segments[-1].map.keyframes
         for row, keyframe in list(enumerate(keyframes))[-2:]:
             if keyframe.index == frame.index:
@@ -196,7 +198,7 @@ class KeyframeOdometry:
                 self._add_keyframe(segment, frame, track_ids, places)
                 segment.frames[-1] = self._tracked(frame, track_ids, pixels)
                 return
-        self._keep_turn(turn_since(last, frame.index, track_ids, pixels, self._intrinsics))
+        self._keep_turn(self._moved_since(last, frame, track_ids, pixels))
         if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), _LEAST_START_TRACKS):
             seen = (k for k in local.keyframes if np.isin(track_ids, k.track_ids).sum() >= _LEAST_START_TRACKS)
             local.keyframes[:] = list(seen)
@@ -213,7 +215,7 @@ class KeyframeOdometry:
         if is_turn(rotation_and_parallax(rays_first, rays, intrinsics)[1], intrinsics):
             return False
         frames = [frame for frame in segment.frames if frame.index > first.index]
-        between = [_common(track_ids, each) for each in _spread(frames[:-1])]
+        between = [view_of(track_ids, each) for each in spread(frames[:-1])]
         found = first_points(rays_first, pixels, between, intrinsics, self._seed)
         if found is None:
             return False
@@ -227,6 +229,12 @@ class KeyframeOdometry:
         local.keyframes[:] = [first]
         self._add_first_keyframes(segment, later)
         return True
+
+    def _moved_since(
+        self, keyframe: TrackedKeyframe, frame: Frame, track_ids: TrackIds, pixels: Pixels
+    ) -> RelativePose | None:
+        depth = self._state.learned_depth
+        return motion_since(keyframe, frame.index, track_ids, pixels, depth, self._intrinsics, self._seed)
 
     def _keep_turn(self, turn: RelativePose | None) -> None:
         """Keep a turn with the map in which the camera is lost, else with the newest."""
@@ -242,7 +250,7 @@ class KeyframeOdometry:
             state.lost += 1
             state.T_last_step = np.eye(4)
             segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None))
-            self._keep_turn(turn_since(segment.map.keyframes[-1], frame.index, track_ids, pixels, self._intrinsics))
+            self._keep_turn(self._moved_since(segment.map.keyframes[-1], frame, track_ids, pixels))
             if (state.lost + 1) * since > _MAX_LOST_S:
                 self._begin(frame)
             return
@@ -305,7 +313,7 @@ class KeyframeOdometry:
     def _add_first_keyframes(self, segment: MapSegment, later: Sequence[TrackedKeyframe]) -> None:
         """Keyframes and frames between the first two keyframes of a map: more views of the first points."""
         local, first, pending = segment.map, segment.map.keyframes[0], {each.index: each for each in later}
-        chosen = {frame.index for frame in _spread(segment.frames[:-1])} | pending.keys()
+        chosen = {frame.index for frame in spread(segment.frames[:-1])} | pending.keys()
         for frame in segment.frames[:-1]:
             known = local.known(frame.track_ids)
             if frame.index not in chosen or known.sum() < MIN_POINTS:
@@ -335,15 +343,3 @@ class KeyframeOdometry:
 
     def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
         return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world)
-
-
-def _spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:
-    """Some of these frames, evenly spread, neither the first nor the last."""
-    chosen = np.linspace(0, len(frames) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]
-    return [frames[row] for row in np.unique(chosen) if frames]
-
-
-def _common(track_ids: TrackIds, frame: TrackedFrame) -> View:
-    """Rows of those corners that a frame sees, and their pixels there."""
-    _, rows, seen = np.intersect1d(track_ids, frame.track_ids, assume_unique=True, return_indices=True)
-    return rows, frame.pixels[seen]

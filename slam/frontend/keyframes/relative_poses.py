@@ -13,10 +13,10 @@ from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.turns import SHIFT_SOURCE
+from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.visual.two_view import CORNER_CORRELATION
-from slam.geometry.se3 import FloatArray, apply, invert
+from slam.geometry.se3 import FloatArray, invert
 
-_LEAST_DEPTHS = 20
 _LEAST_LENGTH = 1e-6
 _RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of its step
 _ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
@@ -76,8 +76,8 @@ def keyframe_poses(
         found = _segment_poses(segment, intrinsics, seed)
         poses += found
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
-        turns += [turn.scaled(_median_depth(segment.map)) for turn in segment.turns]
         units[number] = learned_unit(segment.map)
+        turns += [turn.scaled(1.0 / units[number]) for turn in segment.turns]
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
     outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
     _connect(segments, outside)
@@ -130,24 +130,6 @@ def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, 
         pose = _relative(before, last, T, None if seen is None else seen[1])
         found[first, last] = replace(pose, source=LOOP_SOURCE)
     return found
-
-
-def learned_unit(local: LocalMap) -> float:
-    """Learned depth over depth in the map, the median over all sightings by keyframes; 1 where there are few."""
-    ratios = []
-    for keyframe in local.keyframes:
-        depth = apply(keyframe.T_camera_world, local.points[keyframe.track_ids])[:, 2]
-        with np.errstate(invalid="ignore"):
-            ratio = keyframe.learned_depth / depth
-            ratios.append(ratio[np.isfinite(ratio) & (ratio > 0)])
-    joined = np.concatenate(ratios)
-    return float(np.median(joined)) if len(joined) >= _LEAST_DEPTHS else 1.0
-
-
-def _median_depth(local: LocalMap) -> float:
-    """Of the points seen by keyframes."""
-    depths = [apply(k.T_camera_world, local.points[k.track_ids])[:, 2] for k in local.keyframes]
-    return float(np.nanmedian(np.concatenate(depths)))
 
 
 def _seen_from(

@@ -10,7 +10,7 @@ from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, make, rotation_angle, umeyama
 from slam.runtime.storage.serialisation import Serialiser
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).with_name("room.py"))
@@ -130,4 +130,21 @@ def test_a_turn_before_the_first_points_is_measured() -> None:
     for pose in found.poses:
         T_true = invert(truth[pose.from_index]) @ truth[pose.to_index]
         assert np.rad2deg(rotation_angle(pose.T_from_to[:3, :3].T @ T_true[:3, :3])) < 1.0
-        assert pose.from_index >= begun or np.linalg.norm(pose.T_from_to[:3, 3]) == 0.0
+        assert pose.from_index >= begun or np.linalg.norm(pose.T_from_to[:3, 3]) < 0.01
+
+
+def test_a_short_move_before_the_first_points_has_its_length_by_learned_depth() -> None:
+    """A hundredth of the depth is too little parallax for points."""
+    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
+    for k in range(5):
+        T = make(np.eye(3), np.array([0.01 * k, 0.0, 0.0]))
+        view = room.frame(k, T, near=False)
+        odometry.follow(view)
+        odometry.learn(view, room.depth_map(T))
+    (segment,) = odometry.state().segments
+    moved = segment.turns[-1]
+    assert not segment.started
+    assert moved.ends == (0, 4)
+    # learned depth is twice the depth
+    np.testing.assert_allclose(moved.T_from_to[:3, 3], [0.08, 0.0, 0.0], atol=0.02)
+    assert moved.sigmas[3] > 0.2 * 0.06

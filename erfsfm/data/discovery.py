@@ -28,6 +28,7 @@ from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.data.video import Video
 from erfsfm.geometry.camera import Camera
 
+INDOOR_HEIGHT_M = 0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
 _COLOUR = (2, 3)
 
 
@@ -96,10 +97,10 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
 
 
 def _simulated_height(root: OdometryRoot) -> float | None:
-    """The camera's height in a simulated world; None in a real root, or where no file tells."""
+    """The camera's height in a simulated world, in rooms `INDOOR_HEIGHT_M`; None in a real root."""
     file = root.base / CAMERA_FILE
     simulated = root.simulation_seed() is not None and file.is_file()
-    return read_camera_file(file).height_or(None) if simulated else None
+    return read_camera_file(file).height_or(None) or INDOOR_HEIGHT_M if simulated else None
 
 
 def open_drive(drive: Path) -> list[Recording]:

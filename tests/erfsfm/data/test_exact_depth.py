@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader
 
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
 from erfsfm.data.exact_depth import FARTHEST_M, by_label, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.samples import FOCAL_LENGTH
@@ -20,6 +21,7 @@ from erfsfm.data.snippets import SnippetDraws, split_recordings
 from erfsfm.training.run import train
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.rooms import SimulatedRooms
 from slam.simulation.street import SimulatedStreet
 
 SIZE = (64, 96)
@@ -48,6 +50,14 @@ def mixed(world: Path, write_root: Callable[..., Path], tmp_path: Path) -> Calla
         return ExperimentConfig.model_validate(sections)
 
     return build
+
+
+def test_rooms_are_exact_in_a_unit_of_their_own(tmp_path: Path) -> None:
+    rooms = SimulatedRooms(SimulationOptions("rooms", 2, 0, 64, 48))
+    write_kitti_root(rooms, tmp_path / "rooms", depth=True)
+    (recording,) = discover(tmp_path / "rooms")
+    assert recording.exact
+    assert recording.camera_height_m == INDOOR_HEIGHT_M
 
 
 def test_the_label_is_the_inverse_depth_in_camera_heights(

@@ -27,14 +27,14 @@ logger = logging.getLogger(__name__)
 class Recording:
     """Frames of one drive: ``images`` are their files; of a ``video`` each is the video file.
 
-    ``camera`` belongs to the images as stored. ``start`` is the number of the first frame, by which the files
-    beside the images are indexed. ``depth``, perhaps of some frames alone, and ``poses_file`` are ground truth where it
-    is known, and so is ``camera_height_m``, the unit of depth in a simulated world: above the road, in rooms a constant.
-    The poses are of camera 0, which lies at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the name of its folder in an odometry root, ``oxts``
-    the folder of the GPS/IMU's packets, one a frame. For a part of a recording with gaps, ``skipped`` images come
-    before it and there are ``stored`` in all; pose files may have rows for these alone. ``without_stops`` says that
-    frames in which the car stands still were taken out when it was packed. The frames of one with ``packed`` are in tar
-    files; `erfsfm.data.shard_draws` reads them.
+    ``camera`` belongs to the images as stored. ``start`` is the number of the first frame, by which the files beside
+    the images are indexed. ``depth``, perhaps of some frames alone, and ``poses_file`` are ground truth where it is
+    known, and so is ``camera_height_m``, the unit of depth in a simulated world: above the road, in rooms a constant.
+    The poses are of camera 0, which lies at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the name of its
+    folder in an odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a recording
+    with gaps, ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for these
+    alone. ``without_stops`` says that frames in which the car stands still were taken out when it was packed. The
+    frames of one with ``packed`` are in tar files; `erfsfm.data.shard_draws` reads them.
     """
 
     name: str

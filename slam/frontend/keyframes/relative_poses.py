@@ -12,7 +12,6 @@ from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, Relative
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment
-from slam.frontend.keyframes.turns import SHIFT_SOURCE
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.se3 import FloatArray, apply, invert
 
@@ -81,7 +80,7 @@ def keyframe_poses(
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
     outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
     _connect(segments, outside)
-    poses += [turn for turn in outside if turn.from_index in segments or turn.source == SHIFT_SOURCE]
+    poses += [turn for turn in outside if turn.from_index in segments]
     return KeyframePoses(poses, segments, [closing[ends] for ends in loops], units)
 
 
@@ -89,7 +88,7 @@ def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
     """Give frames that turns lead to, from a map or back from one, the number of that map."""
     for ordered, known, new in ((turns[::-1], 1, 0), (turns, 0, 1)):
         for turn in ordered:
-            if turn.source == KEYFRAME_SOURCE and turn.ends[known] in segments:
+            if turn.ends[known] in segments:
                 segments.setdefault(turn.ends[new], segments[turn.ends[known]])
 
 

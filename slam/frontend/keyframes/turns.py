@@ -12,11 +12,10 @@ from slam.frontend.keyframes.camera_pose import MIN_POINTS
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
-from slam.geometry.se3 import FloatArray, from_rotation_vector, make
+from slam.geometry.se3 import FloatArray, make
 
 _LEAST_PARALLAX_RATIO = 0.0125  # median parallax from which on two views give points, over the image width
-SHIFT_SOURCE = "image shift"  # in metrics.json
-_SHIFT_SIGMA, _SHIFT_LENGTH = np.deg2rad(2.0), 0.1
+_IMAGE_SIGMA, _IMAGE_LENGTH = np.deg2rad(0.5), 0.03
 _ROTATION_SIGMA, _LENGTH_SIGMA = np.deg2rad(0.1), 0.01  # least sigmas, radians and depths
 
 
@@ -57,11 +56,7 @@ def turn_since(
     return RelativePose(keyframe.index, index, make(R.T, np.zeros(3)), sigmas, KEYFRAME_SOURCE)
 
 
-def turn_by_shift(first: int, last: int, shift: Pixels, intrinsics: Intrinsics) -> RelativePose | None:
-    """Between two frames whose images moved as a whole by ``shift`` ``(2,)`` pixels; None where they did not."""
-    if not shift.any():
-        return None
-    yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
-    T_first_last = from_rotation_vector(np.array([pitch, -yaw, 0.0]), np.zeros(3))
-    sigmas = np.repeat([_SHIFT_SIGMA, _SHIFT_LENGTH], 3)
-    return RelativePose(first, last, T_first_last, sigmas, SHIFT_SOURCE)
+def turn_by_image(first: int, last: int, R_last_first: FloatArray) -> RelativePose:
+    """Between two frames whose whole images show a turn."""
+    sigmas = np.repeat([_IMAGE_SIGMA, _IMAGE_LENGTH], 3)
+    return RelativePose(first, last, make(R_last_first.T, np.zeros(3)), sigmas, KEYFRAME_SOURCE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -34,15 +35,25 @@ class KeyframePoses:
     loops: Sequence[RelativePose] = ()
     learned_units: Mapping[int, float] = field(default_factory=dict)
 
+    @cached_property
+    def _linked(self) -> Mapping[int, int]:
+        """The first of the maps that turns link with the map of each frame."""
+        first = {number: number for number in self.segments.values()}
+        for pose in self.poses:
+            one, other = (first.get(self.segments.get(frame, -1)) for frame in pose.ends)
+            if one is not None and other is not None:
+                first = {number: one if linked == other else linked for number, linked in first.items()}
+        return {frame: first[number] for frame, number in self.segments.items()}
+
     def is_inside(self, pose: RelativePose) -> bool:
-        """Whether both frames of a measurement have poses in one map."""
-        first, last = (self.segments.get(frame) for frame in pose.ends)
+        """Whether both frames of a measurement have poses in one map, or in maps that turns link."""
+        first, last = (self._linked.get(frame) for frame in pose.ends)
         return first is not None and first == last
 
     @property
     def steps(self) -> set[Ends]:
-        """Neighbouring frames that both have poses in one map."""
-        return {(k, k + 1) for k, number in self.segments.items() if self.segments.get(k + 1) == number}
+        """Neighbouring frames that both have poses in one map, or in maps that turns link."""
+        return {(k, k + 1) for k, number in self._linked.items() if self._linked.get(k + 1) == number}
 
     def relates(self, first: int) -> bool:
         """Whether the frames before ``first`` and the frames from it on have poses in one map."""

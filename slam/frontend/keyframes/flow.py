@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +17,6 @@ _FORWARD_BACKWARD_PX = 0.7  # largest forward-backward tracking error
 # most iterations, and the shift in pixels below which they end
 _FORWARD, _BACKWARD = (15, 0.02), (10, 0.05)
 _BACKWARD_LEVELS = 1
-_REDUCED = 8  # an image over the reduced one that shows a turn
-# of a phase correlation, for a guess, and for a measurement: images of two places reach 0.46
-_LEAST_RESPONSE, SURE_RESPONSE = 0.03, 0.5
-_LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
-
-Thumbnail = NDArray[np.float32]
 
 
 def flow(first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, levels: int) -> tuple[Pixels, NDArray[np.bool_]]:
@@ -39,21 +32,3 @@ def flow(first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, levels: int
 def new_corners(grey: Grey, taken: Pixels, count: int) -> Pixels:
     """Up to ``count`` corners ``(M, 2)`` of an image, apart from each other and from those taken."""
     return sparse_flow.new_corners(grey, taken, count, _CORNER_QUALITY, _CORNER_SPACING_PX, _CORNER_BLOCK_PX)
-
-
-def image_shift(before: Thumbnail, grey: Grey) -> tuple[Pixels, float, Thumbnail]:
-    """By how many pixels ``(2,)`` an image moved since the one before, how sure that is, and its thumbnail.
-
-    By the phase correlation of reduced images (Kuglin and Hines 1975). Zero where they do not correlate, where flow
-    finds so small a shift by itself, and without an image before.
-    """
-    height, width = grey.shape
-    size = max(width // _REDUCED, 1), max(height // _REDUCED, 1)
-    now = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
-    if before.shape != now.shape:
-        return np.zeros(2, np.float32), 0.0, now
-    window = cv2.createHanningWindow(size, cv2.CV_32F)
-    shift, response = cv2.phaseCorrelate(before.copy(), now.copy(), window)  # which writes into them
-    shift_px = np.float32(_REDUCED) * np.asarray(shift, np.float32)
-    is_turn = response > _LEAST_RESPONSE and np.hypot(*shift_px) > _LEAST_SHIFT_PX
-    return (shift_px if is_turn else np.zeros(2, np.float32)), float(response), now

@@ -18,15 +18,16 @@ from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, RelativePose, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
-from slam.frontend.keyframes.flow import SURE_RESPONSE, Thumbnail, flow, image_shift, new_corners
+from slam.frontend.keyframes.flow import flow, new_corners
+from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, moved, small_image
 from slam.frontend.keyframes.initialisation import first_points, spread, view_of
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
-from slam.frontend.keyframes.turns import is_turn, motion_since, rotation_and_parallax, turn_by_shift
+from slam.frontend.keyframes.turns import is_turn, motion_since, rotation_and_parallax, turn_by_image
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert, make
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +35,8 @@ _LEAST_START_TRACKS = 60
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
+_LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
+_LEAST_CORRELATION, _SURE_CORRELATION = 0.4, 0.8  # of turned images, for a guess, and for a measurement
 _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
@@ -54,7 +57,7 @@ class KeyframeOdometryState:
     stamp: float = 0.0
     learned_depth: float = 1.0  # median of the last image that has one
     turn: FloatArray = field(default_factory=lambda: np.zeros(3))  # a second, where the shutter rolls
-    thumbnail: Thumbnail = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    small: SmallImage = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
 
     def copy(self) -> KeyframeOdometryState:
@@ -128,20 +131,28 @@ class KeyframeOdometry:
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
-        shift, response, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
+        before, self._state.small = self._state.small, small_image(frame.grey)
+        shift = image_shift(before, self._state.small)
+        images = before, self._state.small, self._state.T_last_step[:3, :3], shift, self._intrinsics
+        turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
         since, self._state.stamp = frame.stamp - self._state.stamp, frame.stamp
         if not self._state.segments:
             return self._begin(frame)
         segment = self._state.segments[-1]
-        track_ids, pixels = self._track(segment, frame, shift)
+        track_ids, pixels = self._track(segment, frame, turn)
         self._measure_turn(segment, track_ids, pixels, since)
-        if len(track_ids) < MIN_POINTS and response > SURE_RESPONSE:
-            depth = self._state.learned_depth
-            self._keep_turn(turn_by_shift(segment.last_tracked, frame.index, shift, depth, self._intrinsics))
+        if len(track_ids) < MIN_POINTS:
+            turn = turn or image_turn(*images)
+            if turn.correlation > _SURE_CORRELATION:
+                self._keep_turn(
+                    turn_by_image(segment.last_tracked, frame.index, turn.R_now_before, self._state.learned_depth)
+                )
         if segment.started:
             self._locate(segment, frame, track_ids, pixels, since)
         else:
             self._start(segment, frame, track_ids, pixels)
+        if turn is not None and (self._state.lost or not self._state.segments[-1].started):
+            self._state.T_last_step = make(turn.R_now_before, np.zeros(3))
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
@@ -170,13 +181,15 @@ class KeyframeOdometry:
         state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
         self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
 
-    def _track(self, segment: MapSegment, frame: Frame, shift: Pixels) -> tuple[TrackIds, Pixels]:
-        """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a shift."""
+    def _track(self, segment: MapSegment, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
+        """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a turn."""
         state, keyframe = self._state, segment.map.keyframes[-1]
         rows = np.flatnonzero(~state.slipped)
         if keyframe.grey is None or not len(rows):
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
-        guesses = state.places[rows] + shift
+        guesses = state.places[rows]
+        if turn is not None and turn.correlation > _LEAST_CORRELATION:
+            guesses = moved(guesses, turn.R_now_before, self._intrinsics)
         found, kept = flow(
             keyframe.grey,
             frame.grey,

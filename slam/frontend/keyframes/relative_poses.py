@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,6 @@ from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, Relative
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment
-from slam.frontend.keyframes.turns import SHIFT_SOURCE
 from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.se3 import FloatArray, invert
@@ -35,15 +35,25 @@ class KeyframePoses:
     loops: Sequence[RelativePose] = ()
     learned_units: Mapping[int, float] = field(default_factory=dict)
 
+    @cached_property
+    def _linked(self) -> Mapping[int, int]:
+        """The first of the maps that turns link with the map of each frame."""
+        first = {number: number for number in self.segments.values()}
+        for pose in self.poses:
+            one, other = (first.get(self.segments.get(frame, -1)) for frame in pose.ends)
+            if one is not None and other is not None:
+                first = {number: one if linked == other else linked for number, linked in first.items()}
+        return {frame: first[number] for frame, number in self.segments.items()}
+
     def is_inside(self, pose: RelativePose) -> bool:
-        """Whether both frames of a measurement have poses in one map."""
-        first, last = (self.segments.get(frame) for frame in pose.ends)
+        """Whether both frames of a measurement have poses in one map, or in maps that turns link."""
+        first, last = (self._linked.get(frame) for frame in pose.ends)
         return first is not None and first == last
 
     @property
     def steps(self) -> set[Ends]:
-        """Neighbouring frames that both have poses in one map."""
-        return {(k, k + 1) for k, number in self.segments.items() if self.segments.get(k + 1) == number}
+        """Neighbouring frames that both have poses in one map, or in maps that turns link."""
+        return {(k, k + 1) for k, number in self._linked.items() if self._linked.get(k + 1) == number}
 
     def relates(self, first: int) -> bool:
         """Whether the frames before ``first`` and the frames from it on have poses in one map."""
@@ -81,7 +91,7 @@ def keyframe_poses(
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
     outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
     _connect(segments, outside)
-    poses += [turn for turn in outside if turn.from_index in segments or turn.source == SHIFT_SOURCE]
+    poses += [turn for turn in outside if turn.from_index in segments]
     return KeyframePoses(poses, segments, [closing[ends] for ends in loops], units)
 
 
@@ -89,7 +99,7 @@ def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
     """Give frames that turns lead to, from a map or back from one, the number of that map."""
     for ordered, known, new in ((turns[::-1], 1, 0), (turns, 0, 1)):
         for turn in ordered:
-            if turn.source == KEYFRAME_SOURCE and turn.ends[known] in segments:
+            if turn.ends[known] in segments:
                 segments.setdefault(turn.ends[new], segments[turn.ends[known]])
 
 

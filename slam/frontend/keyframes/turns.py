@@ -12,11 +12,10 @@ from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
-from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, make
+from slam.geometry.se3 import FloatArray, invert, make
 
 _LEAST_PARALLAX_RATIO = 0.0125  # median parallax from which on two views give points, over the image width
-SHIFT_SOURCE = "image shift"  # in metrics.json
-_SHIFT_SIGMA, _SHIFT_LENGTH = np.deg2rad(2.0), 0.1
+_IMAGE_SIGMA, _IMAGE_LENGTH = np.deg2rad(0.5), 0.03
 _ROTATION_SIGMA, _LENGTH_SIGMA = np.deg2rad(0.1), 0.01  # least sigmas, radians and depths
 _DEPTH_SIGMA = 0.2  # of a length by learned depth, over it
 _LEAST_FITTING = 0.7  # ratio of corners that fit a motion by learned depth
@@ -80,11 +79,7 @@ def motion_since(
     return RelativePose(keyframe.index, index, make(R.T, np.zeros(3)), sigmas, KEYFRAME_SOURCE)
 
 
-def turn_by_shift(first: int, last: int, shift: Pixels, depth: float, intrinsics: Intrinsics) -> RelativePose | None:
-    """Between two frames whose images moved by ``shift`` ``(2,)`` pixels, at a usual depth; None where they did not."""
-    if not shift.any():
-        return None
-    yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
-    T_first_last = from_rotation_vector(np.array([pitch, -yaw, 0.0]), np.zeros(3))
-    sigmas = np.repeat([_SHIFT_SIGMA, _SHIFT_LENGTH * depth], 3)
-    return RelativePose(first, last, T_first_last, sigmas, SHIFT_SOURCE)
+def turn_by_image(first: int, last: int, R_last_first: FloatArray, depth: float) -> RelativePose:
+    """Between two frames whose whole images show a turn, at a usual ``depth``."""
+    sigmas = np.repeat([_IMAGE_SIGMA, _IMAGE_LENGTH * depth], 3)
+    return RelativePose(first, last, make(R_last_first.T, np.zeros(3)), sigmas, KEYFRAME_SOURCE)

@@ -1,0 +1,134 @@
+"""How the camera turned since the last image, by aligning small images: bare walls and windows show it without corners.
+
+Small images as PTAM aligns them (Klein and Murray 2008), over the three angles of a turn, with the gradients of the
+first image (Baker and Matthews 2004).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import Grey, Intrinsics
+from slam.geometry.se3 import FloatArray, from_rotation_vector
+
+_REDUCED = 8  # an image over the small one
+_COARSE = 2  # a small image over the one that all guesses are tried on
+_SMOOTH_PX = 4.0  # of small images, around which contrast is local
+_LEAST_CONTRAST = 3.0  # grey levels, of noise
+_OUTLIER = 0.7  # residual of local contrast at which a pixel counts half
+_ITERATIONS, _CONVERGED = 10, 1e-4
+_LEAST_PIXELS = 200
+
+SmallImage = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ImageTurn:
+    """``R_now_before`` and the correlation of the two images turned so, 0 where they share too little."""
+
+    R_now_before: FloatArray
+    correlation: float = 0.0
+
+
+def small_image(grey: Grey) -> SmallImage:
+    """An image at an eighth of its size."""
+    size = max(grey.shape[1] // _REDUCED, 1), max(grey.shape[0] // _REDUCED, 1)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def image_shift(before: SmallImage, now: SmallImage) -> FloatArray:
+    """By how many pixels ``(2,)`` the whole image moved, by phase correlation (Kuglin and Hines 1975)."""
+    if before.shape != now.shape:
+        return np.zeros(2)
+    window = cv2.createHanningWindow(now.shape[::-1], cv2.CV_32F)
+    shift, _ = cv2.phaseCorrelate(before.copy(), now.copy(), window)  # which writes into them
+    return _REDUCED * np.asarray(shift)
+
+
+def image_turn(
+    before: SmallImage, now: SmallImage, R_guess: FloatArray, shift: FloatArray, intrinsics: Intrinsics
+) -> ImageTurn:
+    """The turn from a guess, from the shift of the whole image or from none, whichever makes the images alike."""
+    if before.shape != now.shape:
+        return ImageTurn(np.eye(3))
+    scale = 1.0 / _REDUCED
+    pairs = [(before, now, scale)]
+    if min(now.shape) >= 2 * _COARSE * _SMOOTH_PX:
+        size = now.shape[1] // _COARSE, now.shape[0] // _COARSE
+        coarse = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (before, now))
+        pairs.insert(0, (*coarse, scale / _COARSE))
+    yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
+    R_shift = from_rotation_vector(np.array([-pitch, yaw, 0.0]), np.zeros(3))[:3, :3]
+    found = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
+    for first, second, each in pairs:
+        problem = _Alignment(first, second, intrinsics, each)
+        found = [max((problem.solve(turn.R_now_before) for turn in found), key=lambda turn: turn.correlation)]
+    return found[0]
+
+
+class _Alignment:
+    """Two images of local contrast, one of which is turned until they are alike."""
+
+    def __init__(self, before: SmallImage, now: SmallImage, intrinsics: Intrinsics, scale: float) -> None:
+        sigma = _SMOOTH_PX * scale * _REDUCED
+        first, self._now = _local_contrast(before, sigma), _local_contrast(now, sigma)
+        self._focal = np.array([intrinsics.fx, intrinsics.fy]) * scale
+        self._centre = (np.array([intrinsics.cx, intrinsics.cy]) + 0.5) * scale - 0.5
+        height, width = first.shape
+        y, x = np.mgrid[:height, :width].reshape(2, -1)
+        u, v = (x - self._centre[0]) / self._focal[0], (y - self._centre[1]) / self._focal[1]
+        self._rays = np.stack([u, v, np.ones_like(u)])
+        self._first = first.ravel()
+        gradient = [cv2.Sobel(first, cv2.CV_32F, *axis, scale=0.125).ravel() for axis in ((1, 0), (0, 1))]
+        by_u, by_v = self._focal[0] * gradient[0], self._focal[1] * gradient[1]
+        # of the first image, by a small turn of its rays
+        self._jacobian = np.stack(
+            [-by_u * u * v - by_v * (1 + v * v), by_u * (1 + u * u) + by_v * u * v, by_v * u - by_u * v]
+        )
+
+    def solve(self, R: FloatArray) -> ImageTurn:
+        """From one guess."""
+        for _ in range(_ITERATIONS):
+            turned, inside = self._turned(R)
+            if np.count_nonzero(inside) < _LEAST_PIXELS:
+                return ImageTurn(R)
+            residual = turned - self._first
+            weighted = self._jacobian * (inside / (1.0 + (residual / _OUTLIER) ** 2))
+            information = weighted @ self._jacobian.T + 1e-6 * np.eye(3)
+            step = np.linalg.solve(information, weighted @ residual)
+            R = R @ from_rotation_vector(-step, np.zeros(3))[:3, :3]
+            if np.abs(step).max() < _CONVERGED:
+                break
+        turned, inside = self._turned(R)
+        if np.count_nonzero(inside) < _LEAST_PIXELS:
+            return ImageTurn(R)
+        return ImageTurn(R, float(np.corrcoef(turned[inside], self._first[inside])[0, 1]))
+
+    def _turned(self, R: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """The second image at the pixels of the first one ``(N,)``, and where it shows them."""
+        x, y, z = R @ self._rays
+        ahead = z > 0.1
+        z = np.where(ahead, z, 1.0)
+        u = (x / z * self._focal[0] + self._centre[0]).astype(np.float32)
+        v = (y / z * self._focal[1] + self._centre[1]).astype(np.float32)
+        height, width = self._now.shape
+        inside = ahead & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+        return cv2.remap(self._now, u[None], v[None], cv2.INTER_LINEAR)[0], inside
+
+
+def _local_contrast(image: SmallImage, sigma: float) -> SmallImage:
+    """Without its local mean and over its local contrast, so that neither light nor shadow is motion."""
+    high = image - cv2.GaussianBlur(image, (0, 0), sigma)
+    return np.asarray(high / np.sqrt(cv2.GaussianBlur(high * high, (0, 0), sigma) + _LEAST_CONTRAST**2), np.float32)
+
+
+def moved(pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: Intrinsics) -> NDArray[np.float32]:
+    """Where pixels ``(M, 2)`` of the last image are after a turn; those behind the camera stay."""
+    turned = intrinsics.rays(pixels.astype(np.float64)) @ R_now_before.T
+    ahead = turned[:, 2] > 0.1
+    turned[~ahead, 2] = 1.0
+    return np.where(ahead[:, None], intrinsics.project(turned), pixels).astype(np.float32)

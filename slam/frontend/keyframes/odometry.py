@@ -144,9 +144,8 @@ class KeyframeOdometry:
         if len(track_ids) < MIN_POINTS:
             turn = turn or image_turn(*images)
             if turn.correlation > _SURE_CORRELATION:
-                self._keep_turn(
-                    turn_by_image(segment.last_tracked, frame.index, turn.R_now_before, self._state.learned_depth)
-                )
+                depth = self._state.learned_depth
+                self._keep_turn(turn_by_image(segment.last_tracked, frame.index, turn.R_now_before, depth))
         if segment.started:
             self._locate(segment, frame, track_ids, pixels, since)
         else:

@@ -11,6 +11,7 @@ import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
+from slam.frontend.keyframes.floor import units_by_floor
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.unit import learned_unit
@@ -27,7 +28,7 @@ class KeyframePoses:
     """Relative ``poses`` and ``loops`` in the units of their maps.
 
     ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units`` the unit of learned
-    depth per unit of each map, by its number.
+    depth per unit of each map, by its number: of all maps alike, where they see one floor.
     """
 
     poses: Sequence[RelativePose] = ()
@@ -80,19 +81,20 @@ def keyframe_poses(
     poses: list[RelativePose] = []
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}
-    units: dict[int, float] = {}
     turns: list[RelativePose] = []
-    for number, segment in enumerate(part for part in maps if part.started):
+    maps = [segment for segment in maps if segment.started]
+    learned = [learned_unit(segment.map) for segment in maps]
+    for number, segment in enumerate(maps):
         found = _segment_poses(segment, intrinsics, seed)
         poses += found
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
-        units[number] = learned_unit(segment.map)
-        turns += [turn.scaled(1.0 / units[number]) for turn in segment.turns]
+        turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
     outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
     _connect(segments, outside)
     poses += [turn for turn in outside if turn.from_index in segments]
-    return KeyframePoses(poses, segments, [closing[ends] for ends in loops], units)
+    units = units_by_floor([segment.map for segment in maps], learned, seed)
+    return KeyframePoses(poses, segments, [closing[ends] for ends in loops], dict(enumerate(units)))
 
 
 def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,4 +32,3 @@ def flow(first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, levels: int
 def new_corners(grey: Grey, taken: Pixels, count: int) -> Pixels:
     """Up to ``count`` corners ``(M, 2)`` of an image, apart from each other and from those taken."""
     return sparse_flow.new_corners(grey, taken, count, _CORNER_QUALITY, _CORNER_SPACING_PX, _CORNER_BLOCK_PX)
-

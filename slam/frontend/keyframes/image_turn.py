@@ -6,7 +6,6 @@ first image (Baker and Matthews 2004).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2

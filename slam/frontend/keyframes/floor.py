@@ -12,8 +12,8 @@ from slam.geometry.se3 import invert
 _SAMPLES, _ROUNDS = 1000, 3
 _MOST_POINTS = 2000  # by which planes are compared
 _LEAST_COSINE = 0.8  # between the plane's normal and down by the cameras, which are held upright
-_THICKNESS = 0.03  # of the floor, over the camera's height
-_LEAST_RATIO, _LEAST_POINTS = 0.05, 40  # points on the floor, over all, and in number
+_THICKNESS = 0.04  # of the floor, over the camera's height
+_LEAST_RATIO, _LEAST_POINTS = 0.04, 25  # points on the floor, over all, and in number
 _MOST_BELOW = 0.5  # points below the floor over those on it: a table has the floor below it
 _MOST_SPREAD = 0.15  # of the camera's height
 _MOST_CONTRADICTION = np.log(2.0)  # between two units of a map: a table is half as high
@@ -27,20 +27,18 @@ def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], see
         learned_units: of learned depth per unit of each map.
         seed: of the planes drawn.
     """
-    heights = [height_above_floor(local, seed) for local in maps] if len(maps) > 1 else [None] * len(maps)
-    rows = [row for row, height in enumerate(heights) if height is not None]
-    if not rows:
-        return list(learned_units)
-    weights = [len(maps[row].keyframes) for row in rows]
-    logarithms = [np.log(learned_units[row] * heights[row]) for row in rows]
-    common = float(np.exp(np.average(logarithms, weights=weights)))
-    by_floor = [
-        unit if height is None else common / height for height, unit in zip(heights, learned_units, strict=True)
-    ]
-    return [
-        floor if abs(np.log(floor / unit)) < _MOST_CONTRADICTION else unit
-        for floor, unit in zip(by_floor, learned_units, strict=True)
-    ]
+    units, floors = list(learned_units), {}
+    for row, local in enumerate(maps if len(maps) > 1 else ()):
+        height = height_above_floor(local, seed)
+        if height is not None:
+            floors[row] = height
+    if floors:
+        logarithms = [np.log(height * units[row]) for row, height in floors.items()]
+        common = float(np.exp(np.average(logarithms, weights=[len(maps[row].keyframes) for row in floors])))
+        for row, height in floors.items():
+            if abs(np.log(common / height / units[row])) < _MOST_CONTRADICTION:
+                units[row] = common / height
+    return units
 
 
 def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
@@ -81,11 +79,6 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
         height = float(normal @ middle)
     below = (points @ normal > (1.0 + _THICKNESS) * height).sum()
     each = height - centres @ normal
-    spread = float(np.std(each) / np.median(each))
-    if (
-        normal @ down < _LEAST_COSINE * np.linalg.norm(down)
-        or below > _MOST_BELOW * len(floor)
-        or spread > _MOST_SPREAD
-    ):
-        return None
-    return float(np.median(each))
+    usual = float(np.median(each))
+    is_level = normal @ down > _LEAST_COSINE * np.linalg.norm(down) and np.std(each) < _MOST_SPREAD * usual
+    return usual if is_level and below < _MOST_BELOW * len(floor) else None

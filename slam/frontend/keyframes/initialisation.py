@@ -8,15 +8,15 @@ the frames in between best.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
-from slam.frontend.keyframes.local_map import TrackIds
-from slam.frontend.keyframes.map_segment import TrackedFrame
+from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
@@ -119,6 +119,27 @@ def _alike(one: UnitRelativePose, other: UnitRelativePose) -> bool:
     turned = rotation_angle(one.R_current_previous @ other.R_current_previous.T)
     apart = np.arccos(np.clip(one.direction @ other.direction, -1.0, 1.0))
     return bool(turned < _SAME_MOTION and apart < 4.0 * _SAME_MOTION)
+
+
+def add_first_keyframes(
+    segment: MapSegment, later: Sequence[TrackedKeyframe], intrinsics: Intrinsics, seed: int
+) -> None:
+    """Keyframes and frames between the first two keyframes of a map: more views of the first points."""
+    local, first, pending = segment.map, segment.map.keyframes[0], {each.index: each for each in later}
+    chosen = {frame.index for frame in spread(segment.frames[:-1])} | pending.keys()
+    for frame in segment.frames[:-1]:
+        known = local.known(frame.track_ids)
+        if frame.index not in chosen or known.sum() < MIN_POINTS:
+            continue
+        points, pixels = local.points[frame.track_ids[known]], frame.pixels[known].astype(np.float64)
+        T = resect((np.eye(4),), points, pixels, intrinsics, seed).T_camera_world
+        if frame.index in pending:
+            local.add(replace(pending[frame.index], T_camera_world=T))
+            continue
+        _, rows, seen = np.intersect1d(first.track_ids, frame.track_ids, assume_unique=True, return_indices=True)
+        places, unknown = frame.pixels[seen].astype(np.float64), np.full(len(seen), np.nan)
+        same = first.descriptors[rows]
+        local.add(TrackedKeyframe(frame.index, T, frame.track_ids[seen], places, places, unknown, same, None))
 
 
 def spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:

@@ -20,7 +20,7 @@ from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPos
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import flow, new_corners
 from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, moved, small_image
-from slam.frontend.keyframes.initialisation import first_points, spread, view_of
+from slam.frontend.keyframes.initialisation import add_first_keyframes, first_points, spread, view_of
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
@@ -239,7 +239,7 @@ class KeyframeOdometry:
         self._state.T_camera_world = found.T_current_first
         later = [keyframe for keyframe in local.keyframes if keyframe.index > first.index]
         local.keyframes[:] = [first]
-        self._add_first_keyframes(segment, later)
+        add_first_keyframes(segment, later, intrinsics, self._seed)
         return True
 
     def _moved_since(
@@ -321,24 +321,6 @@ class KeyframeOdometry:
             state.T_camera_world = local.keyframes[-1].T_camera_world
         state.places = local.keyframes[-1].places.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
-
-    def _add_first_keyframes(self, segment: MapSegment, later: Sequence[TrackedKeyframe]) -> None:
-        """Keyframes and frames between the first two keyframes of a map: more views of the first points."""
-        local, first, pending = segment.map, segment.map.keyframes[0], {each.index: each for each in later}
-        chosen = {frame.index for frame in spread(segment.frames[:-1])} | pending.keys()
-        for frame in segment.frames[:-1]:
-            known = local.known(frame.track_ids)
-            if frame.index not in chosen or known.sum() < MIN_POINTS:
-                continue
-            points, pixels = local.points[frame.track_ids[known]], frame.pixels[known].astype(np.float64)
-            T = resect((np.eye(4),), points, pixels, self._intrinsics, self._seed).T_camera_world
-            if frame.index in pending:
-                local.add(replace(pending[frame.index], T_camera_world=T))
-                continue
-            _, rows, seen = np.intersect1d(first.track_ids, frame.track_ids, assume_unique=True, return_indices=True)
-            places, unknown = frame.pixels[seen].astype(np.float64), np.full(len(seen), np.nan)
-            same = first.descriptors[rows]
-            local.add(TrackedKeyframe(frame.index, T, frame.track_ids[seen], places, places, unknown, same, None))
 
     def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
         """How fast the camera turns, for a rolling shutter."""

@@ -15,6 +15,9 @@ from erfsfm.checkpoint import load_model
 from erfsfm.cli import main
 from erfsfm.config import load_experiment
 from erfsfm.model_record import SHIPPED
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 FRAMES = 12
 SEQUENCES = ("00", "02", "05", "06")
@@ -30,7 +33,7 @@ def data(shared: Path, write_root: Callable[..., Path]) -> list[Path]:
     """Tiny drives of every kind that a configuration names."""
     roots = [shared / name for name in ("world", "held_out", "kitti", "folder")]
     if not shared.joinpath("world").exists():
-        write_root(roots[0], FRAMES, seed=0)
+        write_kitti_root(SimulatedStreet(SimulationOptions("straight", FRAMES, 0, 96, 64)), roots[0], depth=True)
         write_root(roots[1], FRAMES, seed=500)
         write_root(roots[2], FRAMES, SEQUENCES)
         roots[3].mkdir()

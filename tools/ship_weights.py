@@ -11,6 +11,7 @@ from pathlib import Path
 from shared.command import markdown, one_line_errors, parser_of
 
 from erfsfm.checkpoint import Model, load_model, save_model
+from erfsfm.common.readers.frame_range import merge
 from erfsfm.model_record import FILES, SHIPPED
 
 LARGEST_MB = 20
@@ -44,6 +45,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("run", type=Path, help="output folder of erfsfm train")
     parser.add_argument("name", help="name of the shipped weights")
+    parser.add_argument("--mean-with", help="weights whose mean with the run's is shipped: those that it began from")
     parser.add_argument("--data", required=True, help="one line: what it was trained on")
     parser.add_argument("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
     parser.add_argument("--command", help="in place of the recorded one, without the paths of one machine")
@@ -53,6 +55,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     model = load_model(arguments.run)
+    if arguments.mean_with:
+        model = averaged(model, load_model(arguments.mean_with))
     folder = SHIPPED / arguments.name
     record = model.record.model_copy(update={"command": arguments.command or model.record.command})
     save_model(folder, Model(record, model.depth_net, model.pose_net), half=True)
@@ -78,6 +82,16 @@ def main() -> None:
     )
     (folder / "README.md").write_text(card)
     print(f"{folder}: read {folder / 'README.md'}")
+
+
+def averaged(model: Model, other: Model) -> Model:
+    """Networks with the mean of both weights (Wortsman et al. 2022, robust fine-tuning)."""
+    for network, start in ((model.depth_net, other.depth_net), (model.pose_net, other.pose_net)):
+        state = start.state_dict()
+        mean = {k: (v + state[k]) / 2 if v.is_floating_point() else v for k, v in network.state_dict().items()}
+        network.load_state_dict(mean)
+    seen = merge([*model.record.trained_on, *other.record.trained_on])
+    return Model(model.record.model_copy(update={"trained_on": seen}), model.depth_net, model.pose_net)
 
 
 def _table(path: Path | None, fallback: dict[str, float]) -> str:

@@ -34,7 +34,7 @@ def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], see
             floors[row] = height
     if floors:
         logarithms = [np.log(height * units[row]) for row, height in floors.items()]
-        common = float(np.exp(np.average(logarithms, weights=[len(maps[row].keyframes) for row in floors])))
+        common = float(np.exp(np.median(logarithms)))
         for row, height in floors.items():
             if abs(np.log(common / height / units[row])) < _MOST_CONTRADICTION:
                 units[row] = common / height

@@ -54,7 +54,7 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
     rng = np.random.default_rng(seed)
     points = rng.permutation(points)[:_MOST_POINTS]
     depth = points @ down
-    low = points[depth > np.median(depth[depth > 0])] if (depth > 0).any() else points
+    low = points[depth >= np.median(depth[depth > 0])] if (depth > 0).any() else points
     corners = low[rng.integers(len(low), size=(_SAMPLES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)

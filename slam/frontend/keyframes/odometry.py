@@ -20,9 +20,9 @@ from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPos
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import flow, new_corners
 from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, moved, small_image
-from slam.frontend.keyframes.initialisation import View, first_points
+from slam.frontend.keyframes.initialisation import first_points
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame, common, spread
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
 from slam.frontend.keyframes.turns import is_turn, rotation_and_parallax, turn_by_image, turn_since
 from slam.frontend.sparse_flow import Pixels
@@ -32,7 +32,6 @@ from slam.geometry.se3 import FloatArray, invert, make
 logger = logging.getLogger(__name__)
 
 _LEAST_START_TRACKS = 60
-_START_KEYFRAMES = 3
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
@@ -225,7 +224,7 @@ class KeyframeOdometry:
         if is_turn(rotation_and_parallax(rays_first, rays, intrinsics)[1], intrinsics):
             return False
         frames = [frame for frame in segment.frames if frame.index > first.index]
-        between = [_common(track_ids, each) for each in _spread(frames[:-1])]
+        between = [common(track_ids, each) for each in spread(frames[:-1])]
         found = first_points(rays_first, pixels, between, intrinsics, self._seed)
         if found is None:
             return False
@@ -317,7 +316,7 @@ class KeyframeOdometry:
     def _add_first_keyframes(self, segment: MapSegment, later: Sequence[TrackedKeyframe]) -> None:
         """Keyframes and frames between the first two keyframes of a map: more views of the first points."""
         local, first, pending = segment.map, segment.map.keyframes[0], {each.index: each for each in later}
-        chosen = {frame.index for frame in _spread(segment.frames[:-1])} | pending.keys()
+        chosen = {frame.index for frame in spread(segment.frames[:-1])} | pending.keys()
         for frame in segment.frames[:-1]:
             known = local.known(frame.track_ids)
             if frame.index not in chosen or known.sum() < MIN_POINTS:
@@ -347,15 +346,3 @@ class KeyframeOdometry:
 
     def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
         return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world)
-
-
-def _spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:
-    """Some of these frames, evenly spread, neither the first nor the last."""
-    chosen = np.linspace(0, len(frames) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]
-    return [frames[row] for row in np.unique(chosen) if frames]
-
-
-def _common(track_ids: TrackIds, frame: TrackedFrame) -> View:
-    """Rows of those corners that a frame sees, and their pixels there."""
-    _, rows, seen = np.intersect1d(track_ids, frame.track_ids, assume_unique=True, return_indices=True)
-    return rows, frame.pixels[seen]

@@ -148,8 +148,8 @@ class KeyframeOdometry:
             self._locate(segment, frame, track_ids, pixels, since)
         else:
             self._start(segment, frame, track_ids, pixels)
-        if turn is not None and (self._state.lost or not self._state.segments[-1].started):
-            self._state.T_last_step = make(turn.R_now_before, np.zeros(3))
+        if self._state.lost or not self._state.segments[-1].started:
+            self._state.T_last_step = make(np.eye(3) if turn is None else turn.R_now_before, np.zeros(3))
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
@@ -236,6 +236,7 @@ class KeyframeOdometry:
         self._state.T_camera_world = found.T_current_first
         later = [keyframe for keyframe in local.keyframes if keyframe.index > first.index]
         local.keyframes[:] = [first]
+        self._state.T_last_step = np.eye(4)
         self._add_first_keyframes(segment, later)
         return True
 

@@ -34,7 +34,7 @@ def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], see
             floors[row] = height
     if floors:
         logarithms = [np.log(height * units[row]) for row, height in floors.items()]
-        common = float(np.exp(np.average(logarithms, weights=[len(maps[row].keyframes) for row in floors])))
+        common = float(np.exp(np.median(logarithms)))
         for row, height in floors.items():
             if abs(np.log(common / height / units[row])) < _MOST_CONTRADICTION:
                 units[row] = common / height
@@ -54,7 +54,7 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
     rng = np.random.default_rng(seed)
     points = rng.permutation(points)[:_MOST_POINTS]
     depth = points @ down
-    low = points[depth > np.median(depth[depth > 0])] if (depth > 0).any() else points
+    low = points[depth >= np.median(depth[depth > 0])] if (depth > 0).any() else points
     corners = low[rng.integers(len(low), size=(_SAMPLES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
-from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.local_map import TrackedKeyframe
+from slam.frontend.keyframes.map_segment import MapSegment, View, spread
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
@@ -28,7 +28,6 @@ from slam.frontend.visual.epipolar import (
 )
 from slam.geometry.se3 import FloatArray, make, rotation_angle
 
-_BETWEEN = 3  # number of frames between the two views that become keyframes too
 _LEAST_POINTS = 40
 _LEAST_RATIO = 0.5
 _INLIER_PX = 1.0
@@ -38,8 +37,6 @@ _AMBIGUOUS = 1.2
 _SAME_MOTION = np.deg2rad(3.0)
 # variance of a corner, square pixels: below it fits do not differ
 _LEAST_COST = 0.04
-
-View = tuple[NDArray[np.intp], Pixels]
 
 
 @dataclass(frozen=True)
@@ -140,15 +137,3 @@ def add_first_keyframes(
         places, unknown = frame.pixels[seen].astype(np.float64), np.full(len(seen), np.nan)
         same = first.descriptors[rows]
         local.add(TrackedKeyframe(frame.index, T, frame.track_ids[seen], places, places, unknown, same, None))
-
-
-def spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:
-    """Some of these frames, evenly spread, neither the first nor the last."""
-    chosen = np.linspace(0, len(frames) - 1, _BETWEEN + 2).astype(int)[1:-1]
-    return [frames[row] for row in np.unique(chosen) if frames]
-
-
-def view_of(track_ids: TrackIds, frame: TrackedFrame) -> View:
-    """Rows of those corners that a frame sees, and their pixels there."""
-    _, rows, seen = np.intersect1d(track_ids, frame.track_ids, assume_unique=True, return_indices=True)
-    return rows, frame.pixels[seen]

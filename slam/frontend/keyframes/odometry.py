@@ -20,9 +20,9 @@ from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPos
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import flow, new_corners
 from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, moved, small_image
-from slam.frontend.keyframes.initialisation import add_first_keyframes, first_points, spread, view_of
+from slam.frontend.keyframes.initialisation import add_first_keyframes, first_points
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame, common, spread
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
 from slam.frontend.keyframes.turns import is_turn, motion_since, rotation_and_parallax, turn_by_image
 from slam.frontend.sparse_flow import Pixels
@@ -150,8 +150,8 @@ class KeyframeOdometry:
             self._locate(segment, frame, track_ids, pixels, since)
         else:
             self._start(segment, frame, track_ids, pixels)
-        if turn is not None and (self._state.lost or not self._state.segments[-1].started):
-            self._state.T_last_step = make(turn.R_now_before, np.zeros(3))
+        if self._state.lost or not self._state.segments[-1].started:
+            self._state.T_last_step = make(np.eye(3) if turn is None else turn.R_now_before, np.zeros(3))
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
@@ -227,7 +227,7 @@ class KeyframeOdometry:
         if is_turn(rotation_and_parallax(rays_first, rays, intrinsics)[1], intrinsics):
             return False
         frames = [frame for frame in segment.frames if frame.index > first.index]
-        between = [view_of(track_ids, each) for each in spread(frames[:-1])]
+        between = [common(track_ids, each) for each in spread(frames[:-1])]
         found = first_points(rays_first, pixels, between, intrinsics, self._seed)
         if found is None:
             return False
@@ -239,6 +239,7 @@ class KeyframeOdometry:
         self._state.T_camera_world = found.T_current_first
         later = [keyframe for keyframe in local.keyframes if keyframe.index > first.index]
         local.keyframes[:] = [first]
+        self._state.T_last_step = np.eye(4)
         add_first_keyframes(segment, later, intrinsics, self._seed)
         return True
 

@@ -35,8 +35,8 @@ _ATTEMPTS = 2
 _MIN_ANGLE_DEG = 0.3  # least angle between rays of a point, degrees
 # least distance over the usual depth: poses are less exact, and near points pass the angle where a camera only turns
 _MIN_BASELINE = 0.01
-# most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted ten
-# times; but in a young map, depth and motion change together for long at hardly any cost
+# most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
+# ten times; but in a young map, depth and motion change together for long at hardly any cost
 _LIMITS, _YOUNG_LIMITS = (12, 1e-3), (60, 1e-6)
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from slam.runtime.errors import RunError
 from slam.runtime.storage.archive import opened_archive
 
-_FORMAT = 8
+_FORMAT = 9
 Tree = Any  # of JSON
 
 

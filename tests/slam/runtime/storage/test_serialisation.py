@@ -143,7 +143,7 @@ def test_arrays_that_are_cut_short_or_of_objects(tmp_path: Path) -> None:
     path = tmp_path / "r"
     for described, content in ((["<f8", [4]], b"\0" * 16), (["|O", [1]], b"\0" * 8)):
         with zipfile.ZipFile(path, "w") as file:
-            file.writestr("tree.json", json.dumps({"format": 8, "value": {"array": 0}, "arrays": [described]}))
+            file.writestr("tree.json", json.dumps({"format": 9, "value": {"array": 0}, "arrays": [described]}))
             file.writestr("arrays.bin", content)
         with pytest.raises(RunError, match="damaged"):
             SERIALISER.read(path)
@@ -153,5 +153,5 @@ def test_another_version(tmp_path: Path) -> None:
     path = tmp_path / "r"
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("tree.json", json.dumps({"format": 1}))
-    with pytest.raises(RunError, match="format 1, this version reads 8"):
+    with pytest.raises(RunError, match="format 1, this version reads 9"):
         SERIALISER.read(path)

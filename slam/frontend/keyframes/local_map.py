@@ -38,6 +38,7 @@ _MIN_BASELINE = 0.01
 # most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
 # ten times; but in a young map, depth and motion change together for long at hardly any cost
 _LIMITS, _YOUNG_LIMITS = (12, 1e-3), (60, 1e-6)
+_YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
 
@@ -160,7 +161,7 @@ class LocalMap:
         noise = Noise()
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
-        limits = _LIMITS if first else _YOUNG_LIMITS
+        limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
         solved = problem.solve(poses, self.points[track_ids], *limits)
         self.points[track_ids] = solved.points
         bad = solved.residual_px > OUTLIER_PX

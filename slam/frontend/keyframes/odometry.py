@@ -55,7 +55,7 @@ class KeyframeOdometryState:
     T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
     lost: int = 0
     stamp: float = 0.0
-    learned_depth: float = 1.0  # median of the last image that has one
+    learned_depth: float = 1.0  # median of the last image in which it is known
     turn: FloatArray = field(default_factory=lambda: np.zeros(3))  # a second, where the shutter rolls
     small: SmallImage = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
@@ -155,7 +155,8 @@ class KeyframeOdometry:
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
-        self._state.learned_depth = float(np.nanmedian(depth))
+        known = depth[np.isfinite(depth) & (depth > 0)]
+        self._state.learned_depth = float(np.median(known)) if len(known) else self._state.learned_depth
         keyframes = self._state.segments[-1].map.keyframes
         for row, keyframe in list(enumerate(keyframes))[-2:]:
             if keyframe.index == frame.index:

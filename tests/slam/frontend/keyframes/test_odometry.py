@@ -133,6 +133,17 @@ def test_a_turn_before_the_first_points_is_measured() -> None:
         assert pose.from_index >= begun or np.linalg.norm(pose.T_from_to[:3, 3]) < 0.01
 
 
+def test_without_learned_depth_a_turn_has_a_length_of_zero() -> None:
+    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
+    for k in range(3):
+        view = room.frame(k, from_rotation_vector(np.array([0.0, 0.02 * k, 0.0]), np.zeros(3)))
+        odometry.follow(view)
+        odometry.learn(view, np.full((room.INTRINSICS.height, room.INTRINSICS.width), np.nan, np.float32))
+    turned = odometry.state().segments[0].turns[-1]
+    np.testing.assert_array_equal(turned.T_from_to[:3, 3], 0.0)
+    assert np.isfinite(turned.sigmas).all() and (turned.sigmas > 0).all()
+
+
 def test_a_short_move_before_the_first_points_has_its_length_by_learned_depth() -> None:
     """A hundredth of the depth is too little parallax for points."""
     odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)

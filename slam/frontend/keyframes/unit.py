@@ -17,9 +17,14 @@ from slam.geometry.se3 import FloatArray, apply, invert
 
 _LEAST_DEPTHS = 20
 _PIXEL_SIGMA = 0.5  # of a sighting, pixels
-_POINT_SIGMA = 0.02  # least relative sigma of the depth of a point
+_POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
+_INDEPENDENT = (
+    10  # number of points with independent errors that all points of a keyframe are worth: they share its pose
+)
 _LEARNED_SIGMA = 0.3  # of a keyframe's unit by learned depth, logarithm: its neighbours err alike
-_EXACT = 0.03  # sigma of the logarithm of the unit from the first keyframe to the last that needs no learned depth
+# sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and from the first keyframe to
+# the last where learned depth is not needed
+_BEGUN, _EXACT = 0.03, 0.05
 
 
 def learned_unit(local: LocalMap) -> float:
@@ -63,7 +68,7 @@ def _carried(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
     for keyframe in local.keyframes:
         tracks = keyframe.track_ids[local.known(keyframe.track_ids)]
         sigma = np.maximum(pixel / np.maximum(angle[tracks], 1e-6), _POINT_SIGMA)
-        variance.append(1.0 / max(float((sigma**-2.0).sum()), 1e-9))
+        variance.append(1.0 / max(_INDEPENDENT * float((sigma**-2.0).sum()) / max(len(tracks), 1), 1e-9))
         camera = invert(keyframe.T_camera_world)[:3, 3]
         fresh = tracks[np.isnan(centre[tracks, 0])]
         centre[fresh] = camera
@@ -71,8 +76,8 @@ def _carried(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
         cosine = (first * now).sum(axis=1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(now, axis=1))
         angle[tracks] = np.maximum(angle[tracks], np.arccos(np.clip(cosine, -1.0, 1.0)))
     carried = np.array(variance[1:])
-    begun = np.flatnonzero(carried < _EXACT**2)
-    carried[: begun[0] if len(begun) else None] = _EXACT**2 / 100  # before its first points have parallax
+    begun = np.flatnonzero(carried < _BEGUN**2)
+    carried[: begun[0] if len(begun) else None] = _BEGUN**2 / 100
     return carried
 
 

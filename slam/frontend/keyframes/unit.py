@@ -22,9 +22,9 @@ _INDEPENDENT = (
     10  # number of points with independent errors that all points of a keyframe are worth: they share its pose
 )
 _LEARNED_SIGMA = 0.3  # of a keyframe's unit by learned depth, logarithm: its neighbours err alike
-# sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and from the first keyframe to
-# the last where learned depth is not needed
-_BEGUN, _EXACT = 0.03, 0.05
+# sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and from the first keyframe
+# to the last where learned depth is not needed
+_BEGUN, _EXACT = 0.03, 0.1
 
 
 def learned_unit(local: LocalMap) -> float:

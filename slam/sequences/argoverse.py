@@ -85,7 +85,7 @@ def _read(path: Path) -> Table:
     (feather,) = import_extra("argoverse")
     try:
         table: Table = feather.read_table(path).to_pydict()
-    except (OSError, ValueError, MemoryError) as error:  # pyarrow's own errors, also of a size announced but not there
+    except (OSError, ValueError, MemoryError, SystemError) as error:  # pyarrow's own, also of sizes that cannot be
         raise SequenceError(f"cannot read table {path}: {' '.join(str(error).split())}; copy it again") from error
     return table
 

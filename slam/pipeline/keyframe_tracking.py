@@ -144,11 +144,11 @@ class KeyframeTracking:
         return before, T_before_frame
 
     def maps(self, drive: Drive) -> tuple[MapSegment, ...]:
-        """All maps so far; none of a vehicle, nor before the choice."""
+        """All maps so far, each in one unit; none of a vehicle, nor before the choice."""
         self.choose(drive)
         if self._odometry is None or self._front_end == "both":
             return ()
-        return tuple(segment.copy() for segment in self._odometry.segments if segment.started)
+        return tuple(evened(each.copy(), self._intrinsics) for each in self._odometry.segments if each.started)
 
     @property
     def events(self) -> Sequence[TrackingEvent]:
@@ -157,7 +157,7 @@ class KeyframeTracking:
 
     def poses(self, maps: Sequence[MapSegment]) -> KeyframePoses:
         """Relative poses of all frames of some maps."""
-        return keyframe_poses([evened(each, self._intrinsics) for each in maps], self._intrinsics, self._seed)
+        return keyframe_poses(maps, self._intrinsics, self._seed)
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:

@@ -18,7 +18,7 @@ from slam.frontend.keyframes.joining import SharedCorners, join
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.keyframes.unit import evened, learned_unit
+from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, apply, invert, make
 from slam.graph.similarity_graph import optimise_similarities
@@ -75,7 +75,7 @@ def close_maps(maps: Sequence[MapSegment], intrinsics: Intrinsics, config: SlamC
         config: of loops and keyframes.
         seed: of RANSAC.
     """
-    maps = [evened(segment, intrinsics) for segment in maps if segment.started]
+    maps = [segment for segment in maps if segment.started]
     rows = _Rows(maps)
     if not maps:
         return MapClosure(KeyframePoses())

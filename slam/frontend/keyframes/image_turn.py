@@ -126,9 +126,9 @@ def _local_contrast(image: SmallImage, sigma: float) -> SmallImage:
     return np.asarray(high / np.sqrt(cv2.GaussianBlur(high * high, (0, 0), sigma) + _LEAST_CONTRAST**2), np.float32)
 
 
-def moved(pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: Intrinsics) -> NDArray[np.float32]:
+def turned(pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: Intrinsics) -> NDArray[np.float32]:
     """Where pixels ``(M, 2)`` of the last image are after a turn; those behind the camera stay."""
-    turned = intrinsics.rays(pixels.astype(np.float64)) @ R_now_before.T
-    ahead = turned[:, 2] > 0.1
-    turned[~ahead, 2] = 1.0
-    return np.where(ahead[:, None], intrinsics.project(turned), pixels).astype(np.float32)
+    rays = intrinsics.rays(pixels.astype(np.float64)) @ R_now_before.T
+    ahead = rays[:, 2] > 0.1
+    rays[~ahead, 2] = 1.0
+    return np.where(ahead[:, None], intrinsics.project(rays), pixels).astype(np.float32)

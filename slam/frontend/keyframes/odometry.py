@@ -19,7 +19,7 @@ from slam.frames import DepthMap, Event, Frame, Intrinsics, RelativePose, Tracki
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import flow, new_corners
-from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, moved, small_image
+from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, small_image, turned
 from slam.frontend.keyframes.initialisation import add_first_keyframes, first_points
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame, common, spread
@@ -55,7 +55,6 @@ class KeyframeOdometryState:
     T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
     lost: int = 0
     stamp: float = 0.0
-    learned_depth: float = 1.0  # median of the last image in which it is known
     turn: FloatArray = field(default_factory=lambda: np.zeros(3))  # a second, where the shutter rolls
     small: SmallImage = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
@@ -144,7 +143,7 @@ class KeyframeOdometry:
         if len(track_ids) < MIN_POINTS:
             turn = turn or image_turn(*images)
             if turn.correlation > _SURE_CORRELATION:
-                depth = self._state.learned_depth
+                depth = self._usual_depth()
                 self._keep_turn(turn_by_image(segment.last_tracked, frame.index, turn.R_now_before, depth))
         if segment.started:
             self._locate(segment, frame, track_ids, pixels, since)
@@ -155,8 +154,6 @@ class KeyframeOdometry:
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
-        known = depth[np.isfinite(depth) & (depth > 0)]
-        self._state.learned_depth = float(np.median(known)) if len(known) else self._state.learned_depth
         keyframes = self._state.segments[-1].map.keyframes
         for row, keyframe in list(enumerate(keyframes))[-2:]:
             if keyframe.index == frame.index:
@@ -178,7 +175,7 @@ class KeyframeOdometry:
         if state.segments:
             self._note(state.segments[-1].frames[-state.lost].index, "lost")
         state.segments.append(MapSegment())
-        state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
+        state.T_camera_world, state.lost = np.eye(4), 0
         self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
 
     def _track(self, segment: MapSegment, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
@@ -189,7 +186,7 @@ class KeyframeOdometry:
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         guesses = state.places[rows]
         if turn is not None and turn.correlation > _LEAST_CORRELATION:
-            guesses = moved(guesses, turn.R_now_before, self._intrinsics)
+            guesses = turned(guesses, turn.R_now_before, self._intrinsics)
         found, kept = flow(
             keyframe.grey,
             frame.grey,
@@ -247,8 +244,17 @@ class KeyframeOdometry:
     def _moved_since(
         self, keyframe: TrackedKeyframe, frame: Frame, track_ids: TrackIds, pixels: Pixels
     ) -> RelativePose | None:
-        depth = self._state.learned_depth
+        depth = self._usual_depth()
         return motion_since(keyframe, frame.index, track_ids, pixels, depth, self._intrinsics, self._seed)
+
+    def _usual_depth(self) -> float:
+        """The median learned depth at the corners of the last keyframe where it is known, 1 before the first."""
+        for segment in reversed(self._state.segments):
+            for keyframe in reversed(segment.map.keyframes):
+                known = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
+                if len(known):
+                    return float(np.median(known))
+        return 1.0
 
     def _keep_turn(self, turn: RelativePose | None) -> None:
         """Keep a turn with the map in which the camera is lost, else with the newest."""
@@ -262,7 +268,6 @@ class KeyframeOdometry:
         pose = self._resected(segment, track_ids[known], pixels[known]) if known.any() else None
         if pose is None:
             state.lost += 1
-            state.T_last_step = np.eye(4)
             segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None))
             self._keep_turn(self._moved_since(segment.map.keyframes[-1], frame, track_ids, pixels))
             if (state.lost + 1) * since > _MAX_LOST_S:

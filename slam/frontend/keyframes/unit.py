@@ -18,9 +18,7 @@ from slam.geometry.se3 import FloatArray, apply, invert
 _LEAST_DEPTHS = 20
 _PIXEL_SIGMA = 0.5  # of a sighting, pixels
 _POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
-_INDEPENDENT = (
-    10  # number of points with independent errors that all points of a keyframe are worth: they share its pose
-)
+_INDEPENDENT = 10  # points with independent errors that those of a keyframe are worth: all share its pose
 _LEARNED_SIGMA = 0.3  # of a keyframe's unit by learned depth, logarithm: its neighbours err alike
 # sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and from the first keyframe
 # to the last where learned depth is not needed

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import os
 import shlex
 import shutil
@@ -75,10 +76,11 @@ def main(words: Sequence[str] | None = None) -> None:
     with workers(at_a_time, scheduler) as spread:
         results = measured(jobs, spread)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
-    with (options.output / f"{options.mode}.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, table_of_runs[0])
-        writer.writeheader()
-        writer.writerows(table_of_runs)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, table_of_runs[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table_of_runs)
+    write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_text(table.getvalue(), "utf-8"))
     drives = [(path, "DRIVE") for name in ("drives", "folders") for path in getattr(options, name, ())]
     text = page.section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
     roots = [(getattr(options, name, None), name.upper()) for name in _ROOTS]

@@ -30,8 +30,9 @@ CARD = """# Weights `{name}`
 | commit | {commit} |
 | licence | {licence} |
 
-Trained without labels, from images and intrinsics alone. Depth and poses share one unit, about ten camera heights.
 {note}
+
+Depth and poses share one unit, about ten camera heights.
 
 Measured (`{evaluation}`):
 
@@ -49,7 +50,7 @@ def main() -> None:
     parser.add_argument("--data", required=True, help="one line: what it was trained on")
     parser.add_argument("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
     parser.add_argument("--command", help="in place of the recorded one, without the paths of one machine")
-    parser.add_argument("--note", default="", help="a paragraph for the card")
+    parser.add_argument("--note", required=True, help="a paragraph for the card: what taught each network, and how")
     parser.add_argument("--metrics", type=Path, help="output of erfsfm evaluate ... --json")
     parser.add_argument("--evaluation", default="validation of the training run", help="the command behind --metrics")
     arguments = parser.parse_args()

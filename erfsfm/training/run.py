@@ -44,7 +44,7 @@ from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
 from erfsfm.training.progress import StepProgress
 from erfsfm.training.reach import without_gradient
-from erfsfm.training.supervision import measured_views
+from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ def train(
     draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
-    seen = merge([*trained_on(draws.recordings), *before])
+    seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
     keeper = _keeper(config.training, output, seen, command, bool(validation), device)
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
@@ -165,12 +165,14 @@ def _draws(
     draws, done = config.training.steps * together, done_steps * together
     if sharded and config.data.exact > 0:
         raise ConfigError("data.exact needs worlds as files, not in shards: set data.exact=0, or name the worlds")
+    if sharded and config.teacher.views == "network":
+        raise ConfigError("teacher.views=network needs images as files, not in shards: name the data sets themselves")
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
     folder = config.teacher.cache or output / MEASUREMENTS
     _, measured = by_label(training, config.data)
     many_views = measured_views(measured, config, folder, progress)
-    return SnippetDraws(training, config, draws, done, rank, many_views)
+    return SnippetDraws(training, config, draws, done, rank, many_views, imitated(config))
 
 
 def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:

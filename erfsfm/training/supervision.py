@@ -1,4 +1,4 @@
-"""The many-view teacher's measurements of all training drives, made before the first step."""
+"""What teaches depth: measurements of many views, made before the first step, or a network that is imitated."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import ConfigError
 from erfsfm.common.progress import Progress
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.many_view_teacher import ManyViewTeacher, Measures
+from erfsfm.data.many_view_teacher import Guess, ManyViewTeacher, Measures
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.model_record import find_weights, read_record
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,27 @@ class GuessedDepth:
 def _predictor(weights: str) -> DepthPosePredictor:
     """In this process."""
     return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
+
+
+def imitated(config: ExperimentConfig) -> Guess | None:
+    """Inverse depth in network units as the reference camera would see it, by the network that is imitated, if any."""
+    return GuessedDepth(config.teacher.slam_weights) if config.teacher.views == "network" else None
+
+
+def seen_by_imitated(config: ExperimentConfig) -> list[str]:
+    """What the imitated network was trained on, and the network that imitates it has then seen, too.
+
+    Raises:
+        CheckpointError: there are no such weights.
+        ConfigError: they have no depth network.
+    """
+    name = config.teacher.slam_weights
+    if config.teacher.views != "network":
+        return []
+    record = read_record(find_weights(name) / "model.yaml")
+    if record.networks == "pose":
+        raise ConfigError(f"teacher.slam_weights '{name}' have no depth network to imitate: name weights that have one")
+    return record.trained_on
 
 
 def measured_views(

@@ -137,12 +137,15 @@ class LossConfig(Section):
 class TeacherConfig(Section):
     """Pseudo-labels from classical geometry of the same images; off by default."""
 
-    views: Literal["two", "many"] = Field(
+    views: Literal["two", "many", "network"] = Field(
         default="two",
-        description="two: each snippet by itself; many: poses by the SLAM system, depth from six neighbours",
+        description="two: each snippet by itself; many: poses by the SLAM system, depth from six neighbours; network: "
+        "the depth of the network of slam_weights, which is imitated",
     )
     stride: int = Field(default=2, ge=1, description="every how many frames a label is measured under many views")
-    slam_weights: str = Field(default="sim", description="weights of the SLAM system that gives the poses")
+    slam_weights: str = Field(
+        default="sim", description="weights of the SLAM system that gives the poses, or of the imitated network"
+    )
     rotation_weight: float = Field(
         default=0.0, ge=0, description="weight of the rotation error; measured rotations then also warp the images"
     )
@@ -280,10 +283,16 @@ class ExperimentConfig(Section):
                 "network.masks needs a loss.mask_weight above 0 (Zhou et al. 2017 take 0.2): without it masks of zero "
                 "have the least loss, and nothing else is learned"
             )
-        if self.data.exact > 0 and (self.teacher.views != "many" or self.teacher.structure_weight == 0):
+        if self.data.exact > 0 and (self.teacher.views == "two" or self.teacher.structure_weight == 0):
             raise ValueError(
-                "data.exact needs teacher.views: many, whose lengths have the unit of exact depth, and a "
+                "data.exact needs teacher.views: many or network, whose lengths have the unit of exact depth, and a "
                 "teacher.structure_weight above 0"
+            )
+        by_motion = self.training.networks != "depth" or self.loss.photometric_weight > 0
+        if self.teacher.views == "network" and (by_motion or self.teacher.structure_weight == 0):
+            raise ValueError(
+                "teacher.views: network teaches depth alone: set training.networks=depth, loss.photometric_weight=0 "
+                "and a teacher.structure_weight above 0"
             )
         if self.training.networks == "pose" and self.teacher.views != "many":
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")

@@ -11,7 +11,7 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.augmentation import Maps, augment
 from erfsfm.data.weather import weathered
 from erfsfm.geometry.camera import Camera
-from erfsfm.labels.structure import TeacherStructure
+from erfsfm.labels.structure import HEIGHTS, TeacherStructure
 
 # An image does not show its focal length. Under a teacher with one scale a drive, lengths are those of a camera of this
 # focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
@@ -54,7 +54,7 @@ def training_sample(
     if seen is not None:
         T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
         nearer = 1.0
-        if config.teacher.views == "many":
+        if config.teacher.views != "two":
             nearer = _nearer(varied, config)
             T_source_target = T_source_target.copy()
             T_source_target[:, :3, 3] /= nearer
@@ -81,6 +81,12 @@ def single_image(
     images, bounds, varied, _ = augment([image], bounds, camera, config.data, config.network.fidelity, rng)
     sample = {"target": _stacked(images)[0], "K": torch.from_numpy(varied.K)}
     return sample | _bounds(bounds, _nearer(varied, config))
+
+
+def depth_alone(inverse_depth: NDArray[np.float32], camera: Camera, config: ExperimentConfig) -> TeacherStructure:
+    """A structure of unknown motion with the inverse depth ``(H, W)`` that a network gives for an image."""
+    bound = (inverse_depth / np.float32(HEIGHTS * _nearer(camera, config))).astype(np.float16)
+    return TeacherStructure(np.full((config.network.sources, 4, 4), np.nan, np.float32), bound, bound)
 
 
 def _nearer(camera: Camera, config: ExperimentConfig) -> float:

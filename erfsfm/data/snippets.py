@@ -21,12 +21,13 @@ from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
 from erfsfm.data.exact_depth import ExactImages, by_label
-from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.many_view_teacher import Guess, ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from erfsfm.data.samples import as_tensors, training_sample
+from erfsfm.data.samples import as_tensors, depth_alone, training_sample
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
+from erfsfm.geometry.camera import Camera
 from erfsfm.labels.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
@@ -46,6 +47,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         first_draw: int = 0,
         rank: int = 0,
         many_views: ManyViewTeacher | None = None,
+        imitated: Guess | None = None,
     ) -> None:
         self._config = config
         self._draws = draws
@@ -55,7 +57,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._cache = ImageCache(images_mb, config.network.height, config.network.width)
         self._reader = SnippetReader()
         self._structures = StructureCache(config.teacher.cache)
-        self._many_views = many_views
+        self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
         exact, self._measured = by_label(self.recordings, config.data)
@@ -85,7 +87,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         )
         recording, which = snippet.recording, self.recordings.index(snippet.recording)
         camera = recording.camera.resized(network.width, network.height, network.fidelity)
-        seen = self._structure(snippet, images, camera.K)
+        seen = self._structure(snippet, images, camera)
         return training_sample(images, camera, seen, (which, snippet.first), self._config, rng)
 
     def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
@@ -104,12 +106,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         return range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
 
     def _structure(
-        self, snippet: Snippet, images: list[NDArray[np.uint8]], K: NDArray[np.float32]
+        self, snippet: Snippet, images: list[NDArray[np.uint8]], camera: Camera
     ) -> TeacherStructure | None:
         """What the teacher measured, if there is one."""
+        if self._imitated is not None:
+            return depth_alone(self._imitated(images[len(images) // 2]), camera, self._config)
         if self._many_views is not None:
             return self._many_views.structure(snippet.recording, snippet.first, self._config.network.sources)
-        return self._structures.structure(images, K) if self._config.teacher.weights else None
+        return self._structures.structure(images, camera.K) if self._config.teacher.weights else None
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):

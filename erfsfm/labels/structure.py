@@ -25,6 +25,7 @@ VERSION = 4
 MIN_SNR = 5.0  # inverse depth over its sigma
 OUTLIER = 3.0  # sigmas from the average
 LEAST_SHARED = 100  # pixels
+HEIGHTS = 10.0  # camera heights in the networks' unit of depth: steps are then as small as initial outputs
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
 from erfsfm.geometry.warp import Projection, project_into_source, sample
+from erfsfm.labels.structure import HEIGHTS
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.regularisation import edge_aware_smoothness, explainability_prior, second_order_smoothness
 from erfsfm.losses.structure import (
@@ -25,8 +26,6 @@ from erfsfm.losses.structure import (
     step_disagreement,
     translation_disagreement,
 )
-
-HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are then as small as initial outputs
 
 
 @dataclass(frozen=True)
@@ -207,7 +206,7 @@ def _teacher_terms(
     if disparities:
         log_scale = bounds.log_scale(disparities[0])
         terms["unit"] = (log_scale - math.log(HEIGHTS)).abs().mean()
-        unit = unit if config.teacher.views == "many" else log_scale.detach()
+        unit = unit if config.teacher.views != "two" else log_scale.detach()
         height, width = bounds.least.shape[-2:]
         levels = [enlarged(disparities[k], k, (height, width)) for k in range(config.loss.scales)]
         terms["structure"] = torch.stack([disagreement(level, bounds, unit) for level in levels]).mean()

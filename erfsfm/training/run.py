@@ -44,7 +44,7 @@ from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
 from erfsfm.training.progress import StepProgress
 from erfsfm.training.reach import without_gradient
-from erfsfm.training.supervision import measured_views
+from erfsfm.training.supervision import imitated, measured_views
 
 logger = logging.getLogger(__name__)
 
@@ -170,7 +170,7 @@ def _draws(
     folder = config.teacher.cache or output / MEASUREMENTS
     _, measured = by_label(training, config.data)
     many_views = measured_views(measured, config, folder, progress)
-    return SnippetDraws(training, config, draws, done, rank, many_views)
+    return SnippetDraws(training, config, draws, done, rank, many_views, imitated(config))
 
 
 def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:

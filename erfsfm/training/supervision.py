@@ -1,4 +1,4 @@
-"""The many-view teacher's measurements of all training drives, made before the first step."""
+"""What teaches depth: measurements of many views, made before the first step, or a network that is imitated."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.progress import Progress
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.many_view_teacher import ManyViewTeacher, Measures
+from erfsfm.data.many_view_teacher import Guess, ManyViewTeacher, Measures
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
 from erfsfm.inference import DepthPosePredictor
@@ -32,6 +32,11 @@ class GuessedDepth:
 def _predictor(weights: str) -> DepthPosePredictor:
     """In this process."""
     return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
+
+
+def imitated(config: ExperimentConfig) -> Guess | None:
+    """Inverse depth in network units as the reference camera would see it, by the network that is imitated, if any."""
+    return GuessedDepth(config.teacher.slam_weights) if config.teacher.views == "network" else None
 
 
 def measured_views(

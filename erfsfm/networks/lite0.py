@@ -23,7 +23,8 @@ STAGES = (  # repeats, kernel, stride, expansion, channels
     (2, 5, 2, 6, 40),
     (3, 3, 2, 6, 80),
     (3, 5, 1, 6, 112),
-    (2, 5, 2, 6, 192),
+    (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
 )
 SKIPS = (1, 2, 3, 5)  # outputs at 1/2, 1/4, 1/8 and 1/16; the stem is stage 0
 SKIP_CHANNELS = (16, 24, 40, 112)

@@ -36,7 +36,7 @@ class Lite0DepthNet(nn.Module):
         self.reductions, self.fusions = nn.ModuleList(), nn.ModuleList()
         for inside, outside, skip in zip(channels, channels[1:], reversed(SKIP_CHANNELS)):  # 1/16 to 1/2
             self.reductions.append(ConvBlock(inside, outside, Layer(3, 1)))
-            self.fusions.append(ConvBlock(outside + skip, outside, Layer(3, 1)))
+            self.fusions.append(ConvBlock(outside + skip, outside, Layer(3, 1) if len(self.fusions) else wide))
         self.last = ConvBlock(channels[-1], channels[-1], Layer(3, 1))
         self.heads = nn.ModuleList(DisparityHead(count) for count in channels[2:])  # at 1/8 to 1/2
         self.full_head = DisparityHead(channels[-1], 4)

@@ -105,9 +105,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         targets = self._many_views.drive(recording).targets(sources)
         return range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
 
-    def _structure(
-        self, snippet: Snippet, images: list[NDArray[np.uint8]], camera: Camera
-    ) -> TeacherStructure | None:
+    def _structure(self, snippet: Snippet, images: list[NDArray[np.uint8]], camera: Camera) -> TeacherStructure | None:
         """What the teacher measured, if there is one."""
         if self._imitated is not None:
             return depth_alone(self._imitated(images[len(images) // 2]), camera, self._config)

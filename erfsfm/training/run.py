@@ -165,6 +165,8 @@ def _draws(
     draws, done = config.training.steps * together, done_steps * together
     if sharded and config.data.exact > 0:
         raise ConfigError("data.exact needs worlds as files, not in shards: set data.exact=0, or name the worlds")
+    if sharded and config.teacher.views == "network":
+        raise ConfigError("teacher.views=network needs images as files, not in shards: name the data sets themselves")
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
     folder = config.teacher.cache or output / MEASUREMENTS

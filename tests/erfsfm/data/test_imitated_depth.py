@@ -1,0 +1,78 @@
+"""Depth of a network as the label of another one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+
+from erfsfm.common.errors import ConfigError
+from erfsfm.config import ExperimentConfig
+from erfsfm.data.snippets import SnippetDraws, split_recordings
+from erfsfm.inference import DepthPosePredictor
+from erfsfm.labels.structure import HEIGHTS
+from erfsfm.losses.structure import Bounds
+from erfsfm.training.run import train
+from erfsfm.training.supervision import imitated
+
+
+def imitation(root: Path, teacher: dict[str, Any] | None = None, **sections: dict[str, Any]) -> ExperimentConfig:
+    """An experiment on one drive that imitates the depth of ``sim``."""
+    tree: dict[str, dict[str, Any]] = {
+        "network": {"height": 64, "width": 96, "sources": 2, "depth_width": 0.1, "pose_width": 0.1},
+        "data": {"workers": 0, "flip": 1, "zoom": 1, "validation": [], "roots": [root]},
+        "loss": {"photometric_weight": 0, "smoothness_weight": 0},
+        "training": {"networks": "depth", "batch": 2, "steps": 1},
+    }
+    for name, section in sections.items():
+        tree[name] |= section
+    given = {"views": "network", "slam_weights": "sim", "structure_weight": 1} | (teacher or {})
+    return ExperimentConfig.model_validate(tree | {"teacher": given})
+
+
+def test_the_label_is_what_the_network_gives(write_root: Callable[..., Path], tmp_path: Path) -> None:
+    config = imitation(write_root(tmp_path / "real", 5))
+    recordings, _ = split_recordings(config.data)
+    sample = SnippetDraws(recordings, config, 1, imitated=imitated(config)).draw(0)
+    shown = np.rint(sample["target"].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    original = np.ascontiguousarray(shown[:, ::-1])  # every image is mirrored
+    disparity = 1 / DepthPosePredictor.from_weights("sim", "cpu", "onnx").depth(original)[:, ::-1]
+    bounds = Bounds(sample["least"][None], sample["most"][None])
+    torch.testing.assert_close(sample["least"], sample["most"])
+    wanted = torch.from_numpy(disparity.copy())[None] / HEIGHTS
+    torch.testing.assert_close(sample["most"], wanted, rtol=2e-3, atol=1e-4)
+    scale = bounds.log_scale(torch.from_numpy(disparity.copy())[None, None])
+    assert float(scale) == pytest.approx(math.log(HEIGHTS), abs=1e-3)
+
+
+def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path) -> None:
+    output = train(imitation(write_root(tmp_path / "real", 5)), tmp_path / "run", device="cpu")
+    assert (output / "last" / "depth.safetensors").is_file()
+    assert not (output / "last" / "pose.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("teacher", "sections"),
+    [
+        ({}, {"training": {"networks": "both"}}),
+        ({}, {"loss": {"photometric_weight": 1}}),
+        ({"structure_weight": 0}, {}),
+    ],
+)
+def test_it_teaches_nothing_but_depth(tmp_path: Path, teacher: dict[str, Any], sections: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="teaches depth alone"):
+        imitation(tmp_path, teacher, **sections)
+
+
+def test_shards_hold_no_images_for_it(
+    write_root: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("erfsfm.training.run.in_shards", lambda *_: True)
+    with pytest.raises(ConfigError, match=r"teacher\.views=network"):
+        train(imitation(write_root(tmp_path / "real", 5)), tmp_path / "run", device="cpu")

@@ -65,7 +65,7 @@ def test_true_depth_is_right_and_constant_depth_is_wrong(world, cache):
     (right,) = rows_of(Networks(recording, right=True), world, cache)
     (wrong,) = rows_of(Networks(recording, right=False), world, cache)
     assert right["images"] == wrong["images"] == 1, "every sixth frame that has two neighbours on either side"
-    assert right["abs_rel"] < 0.08 < 0.2 < wrong["abs_rel"]
+    assert right["abs_rel"] < 0.12 < 0.2 < wrong["abs_rel"]  # one image, whose flow differs by processor
     assert 0.3 < right["known"] == wrong["known"] < 1
     assert right["recording"] == "simulated/704[0:13]" and right["leak"] is False
 

@@ -135,7 +135,7 @@ class LossConfig(Section):
 
 
 class TeacherConfig(Section):
-    """Pseudo-labels from classical geometry of the same images; off by default."""
+    """Pseudo-labels from classical geometry of the same images, or of another network; off by default."""
 
     views: Literal["two", "many", "network"] = Field(
         default="two",

@@ -77,10 +77,10 @@ def main(words: Sequence[str] | None = None) -> None:
         results = measured(jobs, spread)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
     table = io.StringIO()
-    writer = csv.DictWriter(table, table_of_runs[0], lineterminator="\n")
+    writer = csv.DictWriter(table, table_of_runs[0])
     writer.writeheader()
     writer.writerows(table_of_runs)
-    write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_text(table.getvalue(), "utf-8"))
+    write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(table.getvalue().encode()))
     drives = [(path, "DRIVE") for name in ("drives", "folders") for path in getattr(options, name, ())]
     text = page.section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
     roots = [(getattr(options, name, None), name.upper()) for name in _ROOTS]

@@ -41,7 +41,7 @@ class Networks:
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     root = tmp_path_factory.mktemp("world") / "world"
-    street = SimulatedStreet(SimulationOptions(frames=13, seed=704, route="straight", width=416, height=128))
+    street = SimulatedStreet(SimulationOptions(frames=13, seed=707, route="straight", width=416, height=128))
     write_kitti_root(street, root, depth=True)
     return root
 
@@ -65,16 +65,16 @@ def test_true_depth_is_right_and_constant_depth_is_wrong(world, cache):
     (right,) = rows_of(Networks(recording, right=True), world, cache)
     (wrong,) = rows_of(Networks(recording, right=False), world, cache)
     assert right["images"] == wrong["images"] == 1, "every sixth frame that has two neighbours on either side"
-    assert right["abs_rel"] < 0.12 < 0.2 < wrong["abs_rel"]  # one image, whose flow differs by processor
+    assert right["abs_rel"] < 0.08 < 0.2 < wrong["abs_rel"]
     assert 0.3 < right["known"] == wrong["known"] < 1
-    assert right["recording"] == "simulated/704[0:13]" and right["leak"] is False
+    assert right["recording"] == "simulated/707[0:13]" and right["leak"] is False
 
 
 def test_leaks_and_recordings_that_are_not_there_are_refused(world, cache):
     networks = Networks(discover(world)[0], right=False)
     with pytest.raises(DataError, match="no sequence 7"):
         rows_of(networks, world, cache, ["7"])
-    networks.seen = ["simulated/704"]
+    networks.seen = ["simulated/707"]
     with pytest.raises(DataError, match="leak"):
         rows_of(networks, world, cache)
     (row,) = rows_of(networks, world, cache, allow_leak=True)

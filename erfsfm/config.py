@@ -100,6 +100,13 @@ class DataConfig(Section):
     weather: float = Field(
         default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
     )
+    strips: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="probability that an image gets an upright strip of another one of its batch, with its label; "
+        "needs labels alone, without a photometric or smoothness term",
+    )
     exact: float = Field(
         default=0.0,
         ge=0,
@@ -273,8 +280,20 @@ class ExperimentConfig(Section):
         data = self.data.model_copy(update={"roots": [*self.data.roots, *roots]})
         return self.model_copy(update={"data": data})
 
+    @property
+    def single_images(self) -> bool:
+        """Whether labels of depth are all that is learned from, so that a sample needs no other view."""
+        by_images = self.loss.photometric_weight + self.loss.smoothness_weight > 0 or self.network.masks
+        labelled = self.teacher.views != "two" and self.teacher.structure_weight > 0
+        return self.training.networks == "depth" and labelled and not by_images
+
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
+        if self.data.strips > 0 and not self.single_images:
+            raise ValueError(
+                "data.strips needs labels alone: set training.networks=depth, loss.photometric_weight=0, "
+                "loss.smoothness_weight=0, teacher.views=many or network, and a teacher.structure_weight above 0"
+            )
         if self.loss.mask_weight > 0 and not self.network.masks:
             raise ValueError("loss.mask_weight needs network.masks: true")
         both_by_images = self.training.networks == "both" and self.loss.photometric_weight > 0

@@ -27,6 +27,7 @@ from erfsfm.checkpoint import load_model
 from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.recordings import Recording
+from erfsfm.data.samples import in_unit_range
 from erfsfm.data.snippets import ValidationSnippets, split_recordings
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
 from erfsfm.geometry.transforms import pose_vector_to_matrix
@@ -84,7 +85,7 @@ class UnseenSnippets:
         samples = []
         snippets = ValidationSnippets(recordings, config)
         for number in range(len(snippets)):
-            sample = snippets[number]
+            sample = in_unit_range(snippets[number])
             images = [to_network_range(image)[None] for image in sample["sources"]]
             samples.append((to_network_range(sample["target"])[None], images, sample["T_source_target"].numpy()))
         return cls(samples)

@@ -14,7 +14,6 @@ from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import single_image
-from erfsfm.data.weather import weathered
 
 FARTHEST_M = 200.0  # what the simulator leaves unknown is sky
 
@@ -36,11 +35,8 @@ class ExactImages:
         seen = depth_m > 0
         most = height_m / np.where(seen, depth_m, FARTHEST_M)
         image = self._cache.image(recording, index)
-        if rng.random() < self._config.data.weather:
-            image = weathered([image], rng)[0]
         camera = recording.camera.resized(network.width, network.height, network.fidelity)
-        bounds = [np.where(seen, most, 0).astype(np.float32), most.astype(np.float32)]
-        return single_image(image, camera, bounds, self._config, rng)
+        return single_image(image, camera, [np.where(seen, most, 0), most], self._config, rng)
 
 
 def by_label(recordings: Sequence[Recording], config: DataConfig) -> tuple[list[Recording], list[Recording]]:

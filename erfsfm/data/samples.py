@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -39,10 +41,10 @@ def training_sample(
         rng: of all random draws.
 
     Returns:
-        Tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3), and ``frames`` (N + 1): of each image in
-        time order a number that is its own, mirrored another one. With a teacher, also ``T_source_target`` (N, 4, 4),
-        ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With weather, also ``shown`` (N + 1, 3, H, W): the
-        images in time order as the networks see them.
+        Tensors ``target`` (3, H, W) and ``sources`` (N, 3, H, W) in uint8, ``K`` (3, 3), and ``frames`` (N + 1): of
+        each image in time order a number that is its own, mirrored another one. With a teacher, also
+        ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With weather, also
+        ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
     """
     network = config.network
     bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
@@ -69,18 +71,21 @@ def training_sample(
 def single_image(
     image: NDArray[np.uint8],
     camera: Camera,
-    bounds: Maps,
+    bounds: Sequence[NDArray[np.floating]],
     config: ExperimentConfig,
     rng: np.random.Generator,
 ) -> dict[str, Tensor]:
-    """Augment an image ``(H, W, 3)`` with exact bounds of its inverse depth and make it a sample without sources.
+    """Augment an image ``(H, W, 3)`` with bounds of its inverse depth and make it a sample without sources.
 
     Returns:
         Tensors ``target``, ``K``, ``least`` and ``most`` as in `training_sample`.
     """
-    images, bounds, varied, _ = augment([image], bounds, camera, config.data, config.network.fidelity, rng)
+    if rng.random() < config.data.weather:
+        image = weathered([image], rng)[0]
+    maps = [bound.astype(np.float32) for bound in bounds]
+    images, maps, varied, _ = augment([image], maps, camera, config.data, config.network.fidelity, rng)
     sample = {"target": _stacked(images)[0], "K": torch.from_numpy(varied.K)}
-    return sample | _bounds(bounds, _nearer(varied, config))
+    return sample | _bounds(maps, _nearer(varied, config))
 
 
 def depth_alone(inverse_depth: NDArray[np.float32], camera: Camera, config: ExperimentConfig) -> TeacherStructure:
@@ -101,7 +106,7 @@ def _bounds(bounds: Maps, nearer: float) -> dict[str, Tensor]:
 
 
 def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[str, Tensor]:
-    """Images in time order to ``target`` (the middle one), ``sources`` and ``K``; colour in [0, 1]."""
+    """Images in time order to ``target`` (the middle one), ``sources`` and ``K``; colour as uint8."""
     middle = len(images) // 2
     stacked = _stacked(images)
     sources = torch.cat([stacked[:middle], stacked[middle + 1 :]])
@@ -109,8 +114,13 @@ def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[
 
 
 def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
-    """Colour in [0, 1], ``(N + 1, 3, H, W)``."""
-    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
+    """Colour as uint8, ``(N + 1, 3, H, W)``."""
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+
+
+def in_unit_range(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of a batch with colour in [0, 1]; samples hold it as uint8, a quarter of the bytes to hand over."""
+    return {name: each.float() / 255 if each.dtype == torch.uint8 else each for name, each in batch.items()}
 
 
 def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -17,9 +17,11 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
+from erfsfm.data.array_cache import ImageCache
+from erfsfm.data.exact_depth import ExactImages, by_label
 from erfsfm.data.many_view_teacher import motion_alone, snippet_motion
 from erfsfm.data.recordings import Recording
-from erfsfm.data.samples import training_sample
+from erfsfm.data.samples import single_image, training_sample
 from erfsfm.data.shards import Clip, InShards
 from erfsfm.data.snippets import chances, usable
 from erfsfm.labels.structure import StructureCache, TeacherStructure
@@ -41,6 +43,8 @@ class _Stretch(NamedTuple):
 class ShardDraws(IterableDataset[dict[str, Tensor]]):
     """Snippets number ``first_draw`` to ``draws`` of recordings in shards; whole batches go to processes and workers.
 
+    Under ``data.exact`` a batch begins with `ExactImages`, of worlds that are files.
+
     Raises:
         DataError: the shards do not fit the experiment, or are fewer than the loader processes.
     """
@@ -60,11 +64,15 @@ class ShardDraws(IterableDataset[dict[str, Tensor]]):
         self._structures = StructureCache(config.teacher.cache)
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
-        self._places = [_place(recording, config) for recording in self.recordings]
+        exact, self._packed = by_label(self.recordings, config.data)
+        cache = ImageCache(config.data.cache_mb, config.network.height, config.network.width)
+        self._exact = ExactImages(exact, config, cache) if exact else None
+        self._exact_of_batch = config.training.of_batch(config.data.exact)
+        self._places = [_place(recording, config) for recording in self._packed]
         self._packs = list(dict.fromkeys(place.shards for place in self._places))
         self._offsets = np.cumsum([0, *(pack.index.files for pack in self._packs)])
         self._stretches = self._find_stretches()
-        self._weights, self._counts = self._weigh(chances(self.recordings, length, config.data))
+        self._weights, self._counts = self._weigh(chances(self._packed, length, config.data))
         self._filled = np.flatnonzero(self._counts)
         lanes = config.training.processes * max(config.data.workers, 1)
         if len(self._filled) < lanes:
@@ -80,11 +88,17 @@ class ShardDraws(IterableDataset[dict[str, Tensor]]):
         together = training.batch * training.processes
         number = self._first_draw // together + index  # of a batch; the loader begins with worker 0 after a resume too
         lane = number % workers * training.processes + self._rank
-        drawn = self._lane(lane, workers * training.processes, number // workers * training.batch)
+        drawn = self._lane(
+            lane, workers * training.processes, number // workers * (training.batch - self._exact_of_batch)
+        )
         for batch in range(number, self._draws // together, workers):
             first = (batch * training.processes + self._rank) * training.batch
             for draw in range(first, first + training.batch):
-                yield self._sample(*next(drawn), np.random.default_rng([training.seed, draw]))
+                rng = np.random.default_rng([training.seed, draw])
+                if self._exact is not None and draw - first < self._exact_of_batch:
+                    yield self._exact.draw(rng)
+                else:
+                    yield self._sample(*next(drawn), rng)
 
     def _lane(self, lane: int, lanes: int, skip: int) -> Iterator[tuple[int, int, Clip]]:
         """Recording, first frame and clip of the snippets of a lane after the first ``skip``, without end."""
@@ -121,7 +135,10 @@ class ShardDraws(IterableDataset[dict[str, Tensor]]):
             yield stretch.which, first, clips[key]
 
     def _sample(self, which: int, first: int, clip: Clip, rng: np.random.Generator) -> dict[str, Tensor]:
-        recording, sources = self.recordings[which], self._config.network.sources
+        recording, sources = self._packed[which], self._config.network.sources
+        if self._config.single_images:
+            target = first + sources // 2
+            return single_image(clip.image(target), recording.camera, clip.label(target), self._config, rng)
         images = [clip.image(frame) for frame in range(first, first + sources + 1)]
         seen = self._structure(clip, first, images, recording.camera.K)
         return training_sample(images, recording.camera, seen, (which, first - recording.start), self._config, rng)
@@ -148,7 +165,7 @@ class ShardDraws(IterableDataset[dict[str, Tensor]]):
             clips = shards.clips()
             clips = clips[np.argsort(clips[:, 1], kind="stable")]
             step = shards.index.stride if labelled else 1
-            for which, (recording, place) in enumerate(zip(self.recordings, self._places)):
+            for which, (recording, place) in enumerate(zip(self._packed, self._places)):
                 if place.shards != shards:
                     continue
                 begin, end = np.searchsorted(clips[:, 1], [place.number, place.number + 1])

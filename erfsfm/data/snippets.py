@@ -23,7 +23,7 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.exact_depth import ExactImages, by_label
 from erfsfm.data.many_view_teacher import Guess, ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from erfsfm.data.samples import as_tensors, depth_alone, training_sample
+from erfsfm.data.samples import as_tensors, depth_alone, single_image, training_sample
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
@@ -82,13 +82,21 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         rng = np.random.default_rng([training.seed, number])
         if self._exact is not None and number % training.batch < training.of_batch(self._config.data.exact):
             return self._exact.draw(rng)
-        snippet, images = self._reader.first_readable(
-            self._chosen(rng), lambda snippet: load_window(self._cache, snippet, network.sources + 1)
-        )
+        snippet, images = self._reader.first_readable(self._chosen(rng), self._images)
         recording, which = snippet.recording, self.recordings.index(snippet.recording)
         camera = recording.camera.resized(network.width, network.height, network.fidelity)
         seen = self._structure(snippet, images, camera)
+        if self._config.single_images:
+            assert seen is not None, "there are labels"
+            return single_image(images[0], camera, (seen.least, seen.most), self._config, rng)
         return training_sample(images, camera, seen, (which, snippet.first), self._config, rng)
+
+    def _images(self, snippet: Snippet) -> list[NDArray[np.uint8]]:
+        """Those of a sample in time order: the snippet's, or its target alone."""
+        sources = self._config.network.sources
+        if self._config.single_images:
+            return load_window(self._cache, Snippet(snippet.recording, snippet.first + sources // 2), 1)
+        return load_window(self._cache, snippet, sources + 1)
 
     def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
         """Random snippets without end."""

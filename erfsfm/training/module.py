@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from erfsfm.checkpoint import build_networks
 from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig, TrainedNetworks
+from erfsfm.data.samples import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
 from erfsfm.geometry.transforms import pose_vector_to_matrix
@@ -25,6 +26,7 @@ from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
 from erfsfm.networks.presets import NetworkKind
 from erfsfm.training.muon import Muon, is_matrix
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
+from erfsfm.training.strips import with_strips
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -83,11 +85,20 @@ class SelfSupervision(lightning.LightningModule):
             if isinstance(encoder, Lite0Encoder):
                 encoder.take_imagenet()
 
+    def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
+        """Colour to [0, 1] where the networks are."""
+        return in_unit_range(batch)
+
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The loss of one batch; `on_after_backward` stops the run where it is not finite or the depth a constant."""
+        if self.config.data.strips > 0:
+            seed = (self.config.training.seed, self.global_step, self.global_rank)
+            batch = with_strips(batch, self.config.data.strips, np.random.default_rng(seed))
         bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
+        none = batch["target"].new_zeros(0, self.config.network.sources, *batch["target"].shape[1:])
+        sources = batch.get("sources", none)
         snippets = SnippetBatch(
-            batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
+            batch["target"], sources, batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
         )
         result = evaluate_objective(self.depth_net, self.pose_net, snippets, self._config_of_step())
         self._terms = {name: value.detach() for name, value in result.terms.items()}

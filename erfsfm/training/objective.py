@@ -32,7 +32,7 @@ from erfsfm.losses.structure import (
 class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(S, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
-    The sources are of the last S targets; the others are single images with exact bounds of their depth.
+    The sources are of the last S targets; the others are single images with bounds of their depth. S may be 0.
     Measurements of the teacher (`erfsfm.labels.structure`), where one is used: ``T_source_target``
     ``(S, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the B targets' inverse depth.
     With simulated weather: ``shown`` ``(S, N + 1, 3, H, W)``, all images in time order as the networks get them.
@@ -55,8 +55,8 @@ class SnippetBatch:
 
     def snippets(self) -> SnippetBatch:
         """Images and cameras of the targets that have sources."""
-        count = len(self.sources)
-        return SnippetBatch(self.target[-count:], self.sources, self.K[-count:])
+        first = len(self.target) - len(self.sources)
+        return SnippetBatch(self.target[first:], self.sources, self.K[first:])
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class _Prediction:
     def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
         precise = batch.target.dtype
         target, sources = batch.seen()
-        of_snippets = target[-len(batch.sources) :]
+        of_snippets = target[len(target) - len(batch.sources) :]
         disparities: list[Tensor] = []
         if needs_depth(config):
             if not depth_net.training:
@@ -169,7 +169,7 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     finest: Tensor | None = None
     snippets = batch.snippets()
-    for level in range(loss.scales if prediction.disparities else 0):
+    for level in range(loss.scales if prediction.disparities and len(snippets.target) > 0 else 0):
         scale = _Level.of(snippets, prediction.disparities[level][-len(snippets.target) :], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
@@ -184,7 +184,7 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
     if prediction.masks is not None and loss.mask_weight > 0:
         terms["explainability"] = torch.stack([explainability_prior(m) for m in prediction.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
-    if batch.T_source_target is not None and batch.bounds is not None:
+    if batch.bounds is not None:
         teacher_terms = _teacher_terms(prediction, T_source_target, batch.T_source_target, batch.bounds, config)
         terms |= teacher_terms
         for name, weight in config.teacher.weights.items():
@@ -193,7 +193,11 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
 
 
 def _teacher_terms(
-    prediction: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, config: ExperimentConfig
+    prediction: _Prediction,
+    T_source_target: Tensor,
+    T_measured: Tensor | None,
+    bounds: Bounds,
+    config: ExperimentConfig,
 ) -> dict[str, Tensor]:
     """Loss terms of the teacher's measurements.
 
@@ -201,7 +205,7 @@ def _teacher_terms(
     has been fitted to the depth network's, and the unit itself is a separate term. Many views have one scale a drive.
     """
     terms: dict[str, Tensor] = {}
-    unit = T_measured.new_full((len(bounds.least), 1, 1, 1), math.log(HEIGHTS))
+    unit = bounds.least.new_full((len(bounds.least), 1, 1, 1), math.log(HEIGHTS))
     disparities = prediction.disparities
     if disparities:
         log_scale = bounds.log_scale(disparities[0])
@@ -212,7 +216,7 @@ def _teacher_terms(
         terms["structure"] = torch.stack([disagreement(level, bounds, unit) for level in levels]).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)
-    if needs_poses(config):
+    if needs_poses(config) and T_measured is not None:
         t_measured = T_measured[..., :3, 3] * torch.exp(-unit[-len(T_measured) :, ..., 0])
         terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
         terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], t_measured)

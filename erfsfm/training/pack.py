@@ -23,6 +23,7 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress, silent
 from erfsfm.config import ExperimentConfig, NetworkConfig
 from erfsfm.data.compact_label import encode
+from erfsfm.data.exact_depth import by_label
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.pack_index import (
     PackedCamera,
@@ -69,7 +70,8 @@ def pack(
 ) -> PackSummary:
     """Write what a training needs of its data as tar files, one clip after the other in random order.
 
-    With ``teacher.views: many`` the measurements are packed as well, and made where they are not there yet.
+    With ``teacher.views: many`` the measurements are packed as well, and made where they are not there yet. Simulated
+    worlds whose exact depth is the label (``data.exact``) are left out: a training takes them as files beside the pack.
 
     Args:
         config: of the training, with all its data sets.
@@ -87,6 +89,7 @@ def pack(
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ConfigError(f"--output {output} is not empty: choose a new folder; nothing was changed")
     training, validation = split_recordings(config.data)
+    _, training = by_label(training, config.data)
     training = _readable_parts(usable(training, config.network.sources + 1), config.network)
     teacher = measured_views(training, config, config.teacher.cache or output, progress)
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")

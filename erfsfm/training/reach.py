@@ -38,14 +38,14 @@ def _batch(config: ExperimentConfig) -> dict[str, Tensor]:
     network, training = config.network, config.training
     targets, size = training.batch, (network.height, network.width)
     snippets = targets - training.of_batch(config.data.exact)
-    batch = {
-        "target": torch.empty(targets, 3, *size),
-        "sources": torch.empty(snippets, network.sources, 3, *size),
-        "K": torch.empty(targets, 3, 3),
-    }
+    batch = {"target": torch.empty(targets, 3, *size), "K": torch.empty(targets, 3, 3)}
     if config.teacher.views == "many" or config.teacher.weights:
-        batch["T_source_target"] = torch.empty(snippets, network.sources, 4, 4)
         batch |= {bound: torch.empty(targets, 1, *size) for bound in ("least", "most")}
+    if config.single_images:
+        return batch
+    batch["sources"] = torch.empty(snippets, network.sources, 3, *size)
+    if "least" in batch:
+        batch["T_source_target"] = torch.empty(snippets, network.sources, 4, 4)
     if config.data.weather > 0:
         batch["shown"] = torch.empty(snippets, network.sources + 1, 3, *size)
     return batch

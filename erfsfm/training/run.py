@@ -91,7 +91,8 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output, progress)
+    sharded = in_shards(by_label(training, config.data)[1], validation)
+    draws = _draws(training, sharded, config, (done_steps, rank), output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
@@ -163,8 +164,6 @@ def _draws(
     done_steps, rank = position
     together = config.training.batch * config.training.processes
     draws, done = config.training.steps * together, done_steps * together
-    if sharded and config.data.exact > 0:
-        raise ConfigError("data.exact needs worlds as files, not in shards: set data.exact=0, or name the worlds")
     if sharded and config.teacher.views == "network":
         raise ConfigError("teacher.views=network needs images as files, not in shards: name the data sets themselves")
     if sharded:
@@ -288,6 +287,7 @@ def _trainer(
         sync_batchnorm=several and not on_cpu,
         use_distributed_sampler=False,  # each process has its own draws, and all validate everything
         precision=precision,
+        benchmark=not on_cpu,  # every step has the same sizes
         max_steps=training.steps,
         gradient_clip_val=training.gradient_clip or None,
         check_val_every_n_epoch=None,

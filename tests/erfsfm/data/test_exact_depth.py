@@ -17,7 +17,10 @@ from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
 from erfsfm.data.exact_depth import FARTHEST_M, by_label, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.samples import FOCAL_LENGTH
+from erfsfm.data.shard_draws import ShardDraws
 from erfsfm.data.snippets import SnippetDraws, split_recordings
+from erfsfm.model_record import read_record
+from erfsfm.training.pack import pack
 from erfsfm.training.run import train
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
@@ -72,7 +75,7 @@ def test_the_label_is_the_inverse_depth_in_camera_heights(
     height_m = SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64, varied=True)).camera_height_m
     assert recording.camera_height_m == pytest.approx(height_m)
     images = [recording.image(index, *SIZE) for index in range(len(recording))]
-    shown = np.rint(sample["target"].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    shown = sample["target"].permute(1, 2, 0).numpy()
     index = next(k for k, image in enumerate(images) if np.array_equal(image, shown))
     depth_m = recording.true_depth(index)
     assert depth_m is not None
@@ -103,6 +106,27 @@ def test_it_trains(mixed: Callable[..., ExperimentConfig], measure: Callable[...
     measure(config, lambda *_: 0.25)
     output = train(config, tmp_path / "run", device="cpu")
     assert load_experiment(output / "config.yaml").data.exact == 0.5
+
+
+def test_worlds_as_files_train_beside_a_pack_of_the_rest(
+    world: Path, mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path
+) -> None:
+    config = mixed()
+    measure(config, lambda *_: 0.25)
+    pack(config, tmp_path / "pack", quality=95)
+    assert "simulated" not in (tmp_path / "pack" / "pack.yaml").read_text()
+    config = mixed((world, tmp_path / "pack"))
+    config = config.model_copy(update={"teacher": config.teacher.model_copy(update={"cache": None})})
+    recordings, _ = split_recordings(config.data)
+    samples = [*ShardDraws(recordings, config, 12)]
+    assert ["sources" not in sample for sample in samples] == [True, True, False, False] * 3
+    labels = torch.stack([sample["least"] for sample in samples if "sources" in sample])
+    assert float((labels[labels > 0].log() - labels[labels > 0].log().median()).abs().max()) < 0.03
+    resumed = [*ShardDraws(recordings, config, 12, first_draw=8)]
+    for sample, again in zip(samples[8:], resumed, strict=True):
+        torch.testing.assert_close(sample, again)
+    train(config, tmp_path / "run", device="cpu")
+    assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["simulated/1", "kitti_odometry/00[0:12]"]
 
 
 def test_both_kinds_of_recording_are_wanted(world: Path, mixed: Callable[..., ExperimentConfig]) -> None:

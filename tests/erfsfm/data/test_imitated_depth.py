@@ -41,7 +41,7 @@ def test_the_label_is_what_the_network_gives(write_root: Callable[..., Path], tm
     config = imitation(write_root(tmp_path / "real", 5))
     recordings, _ = split_recordings(config.data)
     sample = SnippetDraws(recordings, config, 1, imitated=imitated(config)).draw(0)
-    shown = np.rint(sample["target"].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    shown = sample["target"].permute(1, 2, 0).numpy()
     original = np.ascontiguousarray(shown[:, ::-1])  # every image is mirrored
     disparity = 1 / DepthPosePredictor.from_weights("sim", "cpu", "onnx").depth(original)[:, ::-1]
     bounds = Bounds(sample["least"][None], sample["most"][None])

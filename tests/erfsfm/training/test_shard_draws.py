@@ -148,8 +148,8 @@ def test_samples_are_those_of_the_originals(config: ExperimentConfig, packed: Pa
         if one is None:
             continue
         compared += 1
-        assert (sample["target"] - one["target"]).abs().mean() < 0.03
-        assert (sample["sources"] - one["sources"]).abs().mean() < 0.03
+        assert (sample["target"].float() - one["target"].float()).abs().mean() < 7.5
+        assert (sample["sources"].float() - one["sources"].float()).abs().mean() < 7.5
         torch.testing.assert_close(sample["K"], one["K"])
         torch.testing.assert_close(sample["T_source_target"], one["T_source_target"])
         for bound in ("least", "most"):

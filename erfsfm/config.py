@@ -100,13 +100,6 @@ class DataConfig(Section):
     weather: float = Field(
         default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
     )
-    strips: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="probability that an image gets an upright strip of another one of its batch, with its label; "
-        "needs labels alone, without a photometric or smoothness term",
-    )
     exact: float = Field(
         default=0.0,
         ge=0,
@@ -289,11 +282,6 @@ class ExperimentConfig(Section):
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
-        if self.data.strips > 0 and not self.single_images:
-            raise ValueError(
-                "data.strips needs labels alone: set training.networks=depth, loss.photometric_weight=0, "
-                "loss.smoothness_weight=0, teacher.views=many or network, and a teacher.structure_weight above 0"
-            )
         if self.loss.mask_weight > 0 and not self.network.masks:
             raise ValueError("loss.mask_weight needs network.masks: true")
         both_by_images = self.training.networks == "both" and self.loss.photometric_weight > 0

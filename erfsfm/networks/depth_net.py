@@ -35,11 +35,11 @@ _DEFORMABLE_STAGES: dict[Variant, tuple[int, ...]] = {"dfc": (0, 1, 2, 3), "dfcv
 class DisparityHead(nn.Conv2d):
     """Features to disparity in (0.01, 10.01), in single precision under autocast: bfloat16 has some 300 such values."""
 
-    def __init__(self, in_channels: int) -> None:
-        super().__init__(in_channels, 1, 3, padding=1)
+    def __init__(self, in_channels: int, out_channels: int = 1) -> None:
+        super().__init__(in_channels, out_channels, 3, padding=1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """``(B, C, H, W)`` to ``(B, 1, H, W)``."""
+        """``(B, C, H, W)`` to ``(B, out_channels, H, W)``."""
         kind = features.device.type
         if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
             with torch.autocast(kind, enabled=False):

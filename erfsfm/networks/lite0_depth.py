@@ -13,15 +13,15 @@ from erfsfm.networks.depth_net import FIRST_LOGIT, DisparityHead
 from erfsfm.networks.lite0 import CHANNELS, SKIP_CHANNELS, SKIPS, Lite0Encoder
 
 _DECODER_CHANNELS = (128, 64, 48, 32, 16)  # at 1/32 (the encoder's context), then before each doubling
-_SCALES = 4
-_WIDE_LEVELS = 2  # of the decoder, the coarsest, with deformable convolutions in the wide-field variant
 
 
 class Lite0DepthNet(nn.Module):
     """Encoder-decoder with skip connections and four disparity heads.
 
-    The ``dfc`` variant has the paper's deformable convolutions where a map is coarse: the encoder's last layer, at
-    1/32, and the decoder's convolutions at 1/16 and 1/8. They start as plain ones.
+    The decoder ends at half of the image's size: its last head gives the four pixels of a square as channels (Shi et
+    al. 2016), because convolutions at full size took a quarter of the time. The ``dfc`` variant has the paper's
+    deformable convolutions where a map is coarse: the encoder's last layer, at 1/32, and the decoder's at 1/16. They
+    start as plain ones.
     """
 
     def __init__(self, variant: Variant = "plain", width: float = 1.0) -> None:
@@ -33,19 +33,15 @@ class Lite0DepthNet(nn.Module):
         wide = Layer(3, 1, deformable=deformable)
         context = ConvBlock(CHANNELS, channels[0], wide)
         self.encoder = Lite0Encoder(self.input_channels, context)
-        skips = [*reversed(SKIP_CHANNELS), 0]  # 1/16 to 1/2; the image itself is not a skip
-        before = nn.ModuleList()
-        after = nn.ModuleList()
-        inside = channels[0]
-        for level, (count, skip) in enumerate(zip([*channels[1:], channels[-1]], skips)):
-            before.append(ConvBlock(inside, count, Layer(3, 1)))
-            layer = wide if level < _WIDE_LEVELS else Layer(3, 1)
-            after.append(ConvBlock(count + skip, count, layer))
-            inside = count
-        self.reductions, self.fusions = before, after
-        self.heads = nn.ModuleList(DisparityHead(count) for count in [*channels[1:], channels[-1]][-_SCALES:])
+        self.reductions, self.fusions = nn.ModuleList(), nn.ModuleList()
+        for inside, outside, skip in zip(channels, channels[1:], reversed(SKIP_CHANNELS)):  # 1/16 to 1/2
+            self.reductions.append(ConvBlock(inside, outside, Layer(3, 1)))
+            self.fusions.append(ConvBlock(outside + skip, outside, Layer(3, 1) if len(self.fusions) else wide))
+        self.last = ConvBlock(channels[-1], channels[-1], Layer(3, 1))
+        self.heads = nn.ModuleList(DisparityHead(count) for count in channels[2:])  # at 1/8 to 1/2
+        self.full_head = DisparityHead(channels[-1], 4)
         initialise(self, "default")
-        for head in self.heads:
+        for head in [*self.heads, self.full_head]:
             nn.init.constant_(cast(Tensor, head.bias), FIRST_LOGIT)
 
     @property
@@ -63,15 +59,11 @@ class Lite0DepthNet(nn.Module):
             raise ValueError(f"image must have shape (B, 3, H, W); got {tuple(image.shape)}")
         stages = self.encoder(image)
         features = stages[-1]
-        references: list[Tensor] = [*(stages[k] for k in reversed(SKIPS)), image]
         disparities: list[Tensor] = []
-        for level, (reduce, fuse, reference) in enumerate(zip(self.reductions, self.fusions, references)):
+        for level, (reduce, fuse, skip) in enumerate(zip(self.reductions, self.fusions, reversed(SKIPS))):
             doubled = F.interpolate(reduce(features), scale_factor=2.0, mode="nearest")
-            features = crop_like(doubled, reference)
-            if reference is not image:
-                features = torch.cat([features, reference], dim=1)
-            features = fuse(features)
-            head = level - len(self.fusions) + _SCALES
-            if head >= 0 and (self.training or level == len(self.fusions) - 1):
-                disparities.insert(0, self.heads[head](features))
-        return disparities if self.training else disparities[0]
+            features = fuse(torch.cat([crop_like(doubled, stages[skip]), stages[skip]], dim=1))
+            if self.training and level > 0:
+                disparities.insert(0, self.heads[level - 1](features))
+        finest = crop_like(F.pixel_shuffle(self.full_head(self.last(features)), 2), image)
+        return [finest, *disparities] if self.training else finest

@@ -26,7 +26,6 @@ from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
 from erfsfm.networks.presets import NetworkKind
 from erfsfm.training.muon import Muon, is_matrix
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
-from erfsfm.training.strips import with_strips
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -91,9 +90,6 @@ class SelfSupervision(lightning.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The loss of one batch; `on_after_backward` stops the run where it is not finite or the depth a constant."""
-        if self.config.data.strips > 0:
-            seed = (self.config.training.seed, self.global_step, self.global_rank)
-            batch = with_strips(batch, self.config.data.strips, np.random.default_rng(seed))
         bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
         none = batch["target"].new_zeros(0, self.config.network.sources, *batch["target"].shape[1:])
         sources = batch.get("sources", none)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from erfsfm import DISTRIBUTION as DISTRIBUTION
@@ -12,20 +13,11 @@ if TYPE_CHECKING:
     from slam.results.folder import RunFolder
 
 __all__ = ["RunFolder", "Slam", "run_slam"]
+_HOMES = {"RunFolder": "slam.results.folder", "Slam": "slam.pipeline.live", "run_slam": "slam.commands.run.run"}
 
 
 def __getattr__(name: str) -> Any:
     """Import the system on first use: ``import slam`` alone stays light."""
-    if name == "Slam":
-        from slam.pipeline.live import Slam
-
-        return Slam
-    if name == "RunFolder":
-        from slam.results.folder import RunFolder
-
-        return RunFolder
-    if name == "run_slam":
-        from slam.commands.run.run import run_slam
-
-        return run_slam
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'slam' has no attribute '{name}'")

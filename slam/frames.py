@@ -119,23 +119,18 @@ class Sequence(Protocol):
 
     def __len__(self) -> int:
         """Number of frames."""
-        ...
 
     def frame(self, index: int) -> Frame:
         """Read one frame; ``SequenceError`` where its image cannot be read."""
-        ...
 
     def has_scan(self, index: int) -> bool:
         """Whether a LiDAR scan was taken with a frame."""
-        ...
 
     def scan(self, index: int) -> FloatArray:
         """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR; ``SequenceError`` where unreadable."""
-        ...
 
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -166,15 +161,12 @@ class Predictor(Protocol):
 
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` of a frame, at the image's size: positive and finite, or NaN where unknown."""
-        ...
 
     def snippet(self, frames: list[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet whose target is the middle frame."""
-        ...
 
     def executor(self) -> Executor:
         """A new executor of one thread for this predictor, with its number of cores; the user shuts it down."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -68,12 +68,10 @@ def main(words: Sequence[str] | None = None) -> None:
     if options.mode == "speed":
         _compare_speed(options)
         return
-    at_a_time = getattr(options, "jobs", 1)
-    scheduler = getattr(options, "scheduler", None)
     jobs = _whole_sequences(options) if options.mode == "kitti" else _jobs(options)
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or a recording; see --help")
-    with workers(at_a_time, scheduler) as spread:
+    with workers(options.jobs, options.scheduler) as spread:
         results = measured(jobs, spread)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
     table = io.StringIO()
@@ -82,7 +80,7 @@ def main(words: Sequence[str] | None = None) -> None:
     writer.writerows(table_of_runs)
     write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(table.getvalue().encode()))
     drives = [(path, "DRIVE") for name in ("drives", "folders") for path in getattr(options, name, ())]
-    text = page.section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
+    text = page.section(options.mode, _command(options), results, "several" if options.scheduler else str(options.jobs))
     roots = [(getattr(options, name, None), name.upper()) for name in _ROOTS]
     known = (options.output, "OUTPUT"), (getattr(options, "worlds_in", None), "WORLDS"), *roots, (ROOT, "."), *drives
     for path, name in known:

@@ -158,7 +158,7 @@ def doctor(
 def _print_run(path: Path, metrics: Metrics) -> None:
     from slam.results.error_columns import written
     from slam.results.terminal_tables import metrics_table
-    from slam.runtime.run_files import REPORT, TRAJECTORIES
+    from slam.runtime.run_files import REPORT
     from slam.runtime.storage.record import Missing, known
 
     sequence, provenance, timing = metrics.sequence, metrics.provenance, metrics.timing
@@ -166,8 +166,7 @@ def _print_run(path: Path, metrics: Metrics) -> None:
     if isinstance(sequence.length_m, Missing):
         typer.echo(f"{title}: no errors, for {sequence.length_m.reason}")
     else:
-        errors = {name: getattr(metrics.trajectories, name) for name in TRAJECTORIES}
-        print_table(metrics_table({name: e for name, e in errors.items() if not isinstance(e, Missing)}, title))
+        print_table(metrics_table(metrics.evaluated_errors(), title))
     if (sure := known(metrics.confidence.run)) is not None:
         typer.echo(f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path")
     for note in metrics.unit_notes():

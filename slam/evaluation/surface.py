@@ -56,11 +56,9 @@ class SurfaceTruth(Protocol):
 
     def view(self, frame: int) -> Surface:
         """The surface as one frame measured it."""
-        ...
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:
         """Whether the sensor could have measured points ``(P, 3)`` from any of these frames, if nothing hid them."""
-        ...
 
 
 def thinned(points: FloatArray, voxel_m: float, order: Indices) -> Indices:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -202,10 +203,7 @@ def _between(steps: Mapping[int, FloatArray], a: int, b: int) -> FloatArray:
     """``T_a_b`` from ``T_k_next``."""
     if a > b:
         return invert(_between(steps, b, a))
-    T_a_b = np.eye(4)
-    for k in range(a, b):
-        T_a_b = T_a_b @ steps[k]
-    return T_a_b
+    return reduce(np.matmul, (steps[k] for k in range(a, b)), np.eye(4))
 
 
 def _interpolated_step(step: int, T_from_to: FloatArray, typical: float) -> RelativePose:

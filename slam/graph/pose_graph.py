@@ -98,7 +98,7 @@ class PoseGraph:
                 self._T_world_camera = self._solve(T_world_camera_initial)
                 return self._T_world_camera.copy()
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
-                reason = _first_line(error)
+                reason = str(error).strip().partition("\n")[0]
                 self._drop_newest_loop(reason)
                 _check_connected(self._relative_poses, len(T_world_camera_initial))
         raise SlamError(f"the pose graph cannot be solved even without {len(self._dropped)} loop edges")
@@ -220,10 +220,6 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
     loose = np.flatnonzero(component != component[0])
     if len(loose):
         raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
-
-
-def _first_line(error: RuntimeError) -> str:
-    return str(error).strip().partition("\n")[0]
 
 
 def _anchor(pose: Any, is_loose: bool = False) -> Any:

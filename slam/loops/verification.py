@@ -104,12 +104,10 @@ class LoopVerifier:
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         return Loop(measured, inliers, score)
 
-    def resect(
-        self, points: NDArray[np.float32], pixels: NDArray[np.float32], min_inlier_ratio: float | None = None
-    ) -> Sighting | str:
+    def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
         """The camera pose from ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or the reason for none.
 
-        Points with NaN are left out. ``min_inlier_ratio`` is that of the thresholds by default.
+        Points with NaN are left out.
         """
         thresholds = self._thresholds
         known = np.isfinite(points).all(axis=1)
@@ -117,11 +115,9 @@ class LoopVerifier:
         if len(points_known) < thresholds.min_inliers:
             return f"only {len(points_known)} matches have a trusted depth"
         K = self._intrinsics.K
-        if min_inlier_ratio is None:
-            min_inlier_ratio = thresholds.min_inlier_ratio
         found = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, thresholds.reprojection_px, self._seed)
         count = 0 if found is None else len(found[2])
-        if found is None or count < thresholds.min_inliers or count < min_inlier_ratio * len(points_known):
+        if found is None or count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(points_known):
             return f"only {count} of {len(points_known)} matches are inliers"
         extent = pixels_known[found[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:

@@ -8,7 +8,7 @@ import numpy as np
 
 from erfsfm.mvs.refine import Decide, Road
 from slam.config.sections import MappingConfig
-from slam.frames import DepthMap, Intrinsics
+from slam.frames import Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.depth_error import DepthError
@@ -58,7 +58,8 @@ class KeyframeDepths:
         Where no depth is known they stay as they are.
         """
         some = np.linspace(0, len(self._keyframes) - 1, _SOME).round().astype(int)
-        depths = (self._of_network(self._keyframes[n]) for n in np.unique(some))
+        chosen = (self._keyframes[n] for n in np.unique(some))
+        depths = (each.depth_unscaled * np.float32(self._scale[each.index]) for each in chosen)
         medians = [np.median(known) for depth in depths if (known := depth[np.isfinite(depth)]).size]
         return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
 
@@ -76,6 +77,3 @@ class KeyframeDepths:
         if refined is None:
             return KeyframeDepth(keyframe.index, unbiased, None, image, pose, depth)
         return KeyframeDepth(keyframe.index, refined.depth, refined.relative_sigma, image, pose, depth)
-
-    def _of_network(self, keyframe: Keyframe) -> DepthMap:
-        return keyframe.depth_unscaled * np.float32(self._scale[keyframe.index])

@@ -75,7 +75,7 @@ class Slam:
         Raises:
             SlamError: a scale mode that needs more than images, an impossible camera, or a number out of its range.
         """
-        self._turns = Turns("Slam")
+        self._turns = Turns()
         if not hasattr(predictor, "sources"):
             raise SlamError(f"predictor must be a Predictor, as in Slam.from_weights; got {type(predictor).__name__}")
         _check(intrinsics, camera_height_m, config)

@@ -150,7 +150,7 @@ def _read_npy(path: Path) -> NDArray[Any]:
     try:
         content = read_bytes(path, MAX_IMAGE_BYTES)
         _header_of_npy(path, content)
-        return _plane(np.load(io.BytesIO(content), allow_pickle=False))
+        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False).squeeze())
     except OSError as error:
         raise SlamError(f"cannot read depth {path}: {error.strerror or error}") from error
     except (ValueError, EOFError) as error:
@@ -194,8 +194,3 @@ def _header_of_png(path: Path, content: bytes) -> tuple[int, int]:
             f"{path} is a {kind} picture of {bits} bits: depth is a 16-bit grey PNG, metres x 256 or as depth.png_scale"
         )
     return int.from_bytes(content[20:24]), int.from_bytes(content[16:20])
-
-
-def _plane(array: NDArray[Any]) -> NDArray[Any]:
-    """``(H, W)`` from an array that may have more axes of length 1."""
-    return array.reshape([side for side in array.shape if side != 1])

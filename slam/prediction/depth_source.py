@@ -41,7 +41,6 @@ class DepthSource(Protocol):
 
     def disparity(self, frame: Frame) -> Disparity | None:
         """1/depth ``(h, w)`` of any size, NaN where unknown; None for a frame from before the source's first."""
-        ...
 
 
 class SourcedPredictor:

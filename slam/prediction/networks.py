@@ -27,15 +27,12 @@ class Networks(Protocol):
 
     def prepare(self, image: Image) -> Any:
         """An image as input of the networks."""
-        ...
 
     def disparity(self, image: Any) -> NDArray[np.float32]:
         """Unscaled 1/depth ``(h, w)`` of a prepared image, at the networks' own size."""
-        ...
 
     def poses(self, images: Sequence[Any]) -> NDArray[np.float64]:
         """``T_source_target`` ``(N, 4, 4)`` of N + 1 prepared images in time order, the target in the middle."""
-        ...
 
 
 class NetworkPredictor:

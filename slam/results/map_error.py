@@ -32,11 +32,9 @@ class HasTrueDepth(Protocol):
 
     def true_depth_frames(self) -> range | list[int]:
         """Frames that have it, increasing."""
-        ...
 
     def true_depth(self, index: int) -> FloatArray:
         """Z-depth ``(h, w)`` of one of them in metres, 0 where unknown."""
-        ...
 
 
 class DepthTruth:

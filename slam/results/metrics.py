@@ -284,6 +284,14 @@ class Metrics(Record):
         own = {name: getattr(self, name) for name in self.model_fields_set} | values
         return Metrics(**{name: value for name, value in own.items() if value is not None})
 
+    def all_errors(self) -> dict[str, TrajectoryMetrics | Missing]:
+        """Errors by trajectory, or the reasons of missing ones."""
+        return {name: getattr(self.trajectories, name) for name in Trajectories.model_fields}
+
+    def evaluated_errors(self) -> dict[str, TrajectoryMetrics | Missing]:
+        """Errors of the trajectories that have them."""
+        return {name: errors for name, errors in self.all_errors().items() if not isinstance(errors, Missing)}
+
     @property
     def failure(self) -> str:
         """Why the run failed or did not end, in one line; empty if it is whole."""

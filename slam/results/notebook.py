@@ -8,18 +8,16 @@ from html import escape
 
 from slam.results.error_columns import COLUMNS, written
 from slam.results.folder import RunFolder
-from slam.runtime.run_files import MAP_ABOVE, REPORT, TRAJECTORIES
-from slam.runtime.storage.record import Missing, known
+from slam.runtime.run_files import MAP_ABOVE, REPORT
+from slam.runtime.storage.record import known
 
 
 def html(run: RunFolder) -> str:
     """The run as a piece of HTML without scripts."""
     metrics, picture = run.metrics(), run.path / MAP_ABOVE
-    found = {name: getattr(metrics.trajectories, name) for name in TRAJECTORIES}
     rows = [
         [name, *(written(column.value(errors), column.decimals) for column in COLUMNS)]
-        for name, errors in found.items()
-        if not isinstance(errors, Missing)
+        for name, errors in metrics.evaluated_errors().items()
     ]
     table = _row(["", *(column.name for column in COLUMNS)], "th") + "".join(_row(row, "td") for row in rows)
     title = f"{known(metrics.sequence.name) or run.path.name}: {known(metrics.sequence.frames) or 0} frames"

@@ -18,7 +18,6 @@ from slam.results.error_columns import (
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
-from slam.runtime.run_files import TRAJECTORIES
 from slam.runtime.storage.record import Missing, known
 from slam.runtime.terminal import TerminalTable
 
@@ -52,8 +51,7 @@ def comparison_table(runs: Sequence[RunFolder]) -> TerminalTable:
     rows: list[list[str]] = []
     notes: dict[str, None] = {UNITS: None}
     for name, metrics in zip(_names(runs), _contents(runs)):
-        all_errors: dict[str, Errors] = {each: getattr(metrics.trajectories, each) for each in TRAJECTORIES}
-        errors = {each: found for each, found in all_errors.items() if not isinstance(found, Missing)}
+        errors = metrics.evaluated_errors()
         title = name
         if metrics.failure:
             ended = "failed" if metrics.status == "failed" else "did not end"
@@ -65,7 +63,7 @@ def comparison_table(runs: Sequence[RunFolder]) -> TerminalTable:
         for each, found in errors.items():
             rows.append([title, each, *(written(c.value(found), c.decimals) for c in COLUMNS)])
         if errors:
-            for why, where in missing_by_reason(all_errors, COLUMNS).items():
+            for why, where in missing_by_reason(metrics.all_errors(), COLUMNS).items():
                 notes[f"{DASH} {name}, {' and '.join(where)}: {why}."] = None
         else:
             rows.append([title, "", *[DASH] * len(COLUMNS)])

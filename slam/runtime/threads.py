@@ -43,16 +43,16 @@ def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
 class Turns:
     """The lock of an object whose threads a forked process has not."""
 
-    def __init__(self, name: str) -> None:
-        """Of an object of the class ``name``, in this process."""
-        self.lock, self._process, self._name = RLock(), os.getpid(), name
+    def __init__(self) -> None:
+        """Of an object in this process."""
+        self.lock, self._process = RLock(), os.getpid()
 
     def require_own_process(self) -> None:
         """Raise in a forked process, where a call would wait for ever."""
         if os.getpid() != self._process:
             raise SlamError(
-                "this session is of the process that made it, whose threads a forked one has not: make "
-                f"{self._name} there, or start processes with multiprocessing.get_context('spawn')"
+                "this session is of the process that made it, whose threads a forked one has not: make Slam "
+                "there, or start processes with multiprocessing.get_context('spawn')"
             )
 
 

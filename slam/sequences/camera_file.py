@@ -25,12 +25,10 @@ class Sized(Protocol):
     @property
     def width(self) -> int:
         """Of an image."""
-        ...
 
     @property
     def height(self) -> int:
         """Of an image."""
-        ...
 
 
 @sequence_errors()

@@ -18,7 +18,6 @@ class SourcedSequence(Sequence, Protocol):
 
     def true_poses(self, start: int, stop: int) -> FloatArray | None:
         """``T_world_camera`` of the frames [start, stop), their first the world; None unless all are known."""
-        ...
 
 
 class Excerpt:

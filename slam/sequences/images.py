@@ -20,11 +20,9 @@ class ImageSource(Protocol):
 
     def __len__(self) -> int:
         """Number of images."""
-        ...
 
     def read(self, index: int) -> Image:
         """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` or ``DataError`` where it cannot be read."""
-        ...
 
 
 class ImageFiles:

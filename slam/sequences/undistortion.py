@@ -177,6 +177,11 @@ def pinhole_of(camera: CameraFile) -> Intrinsics:
     return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3)
 
 
+def intrinsics_of(camera: CameraFile) -> Intrinsics:
+    """The camera of images as they are after their distortion, if any, was taken out."""
+    return Undistortion(camera).intrinsics if camera.is_distorted else pinhole_of(camera)
+
+
 def _scaled_hint(camera: CameraFile, width: int, height: int) -> str:
     """The camera file scaled to images of another size, as YAML on one line."""
     scaled = camera.pinhole.resized(width, height)

@@ -102,7 +102,8 @@ class Traffic:
     def placed(self, index: int) -> Mesh | None:
         """The cars within sight at a frame, in the street frame; None if there are none."""
         camera = self._route.T_street_camera[index, :3, 3]
-        T_street_cars = [self._leader(index), *(self._oncoming(start, index) for start in self._starts)]
+        T_street_cars = [self._leader(index)]
+        T_street_cars += [self._at(start + speed * index, left_m, -1.0) for start, speed, left_m in self._starts]
         T_street_cars += [self._at(start + speed * index, left_m, 1.0) for start, speed, left_m in self._passing]
         near = {}
         for number, T_street_car in enumerate(T_street_cars):
@@ -117,9 +118,6 @@ class Traffic:
         """A car in the camera's lane that keeps its distance, until it drives away."""
         faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
         return self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)
-
-    def _oncoming(self, start: tuple[float, float, float], index: int) -> FloatArray | None:
-        return self._at(start[0] + start[1] * index, start[2], -1.0)
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""

@@ -184,11 +184,8 @@ class _Walk:
         self._yaw += angle
 
     def _stay(self, yaw: FloatArray, pitch: FloatArray) -> None:
-        x, y = self._here()
+        x, y = self._parts[-1][-1, :2] if self._parts else self._floor.places[self._place]
         self._add(np.stack([np.full_like(yaw, x), np.full_like(yaw, y), yaw, pitch], axis=1), np.zeros_like(yaw))
-
-    def _here(self) -> FloatArray:
-        return self._parts[-1][-1, :2] if self._parts else self._floor.places[self._place]
 
     def _add(self, part: FloatArray, moved: FloatArray) -> None:
         self._parts.append(part)

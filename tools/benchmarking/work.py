@@ -9,8 +9,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -151,11 +151,9 @@ def revision(checkout: Path = ROOT) -> str:
     return git("rev-parse", "--short=12", "HEAD").strip() + ("-dirty" if changed else "")
 
 
-@contextmanager
-def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
+def workers(count: int, scheduler: str | None) -> AbstractContextManager[Spread]:
     """A map over jobs: one after another, or through Dask, whose workers need not have these modules."""
-    with cluster.workers(count, scheduler, (plan, sys.modules[__name__])) as spread:
-        yield spread
+    return cluster.workers(count, scheduler, (plan, sys.modules[__name__]))
 
 
 def measured(jobs: Sequence[Job], spread: Spread) -> list[JobResult]:

@@ -19,10 +19,6 @@ T = TypeVar("T")
 Identity = tuple[str | None, str | None, str]  # ETag, Last-Modified, size
 
 
-class ChangedError(DownloadError):
-    """The file on the server is not the one that the download began with."""
-
-
 class BrokenError(DownloadError):
     """The connection broke: another attempt may do."""
 
@@ -49,8 +45,7 @@ class Connection:
         """The response with bytes ``first`` to ``last`` of the file; a negative ``first`` counts from its end.
 
         Raises:
-            ChangedError: it is another file than at the first request.
-            DownloadError: the server gives no ranges.
+            DownloadError: it is another file than at the first request, or the server gives no ranges.
             OSError: it does not answer, or refuses.
         """
         wanted = f"bytes={first}-{'' if last is None else last}" if first >= 0 else f"bytes={first}"
@@ -66,7 +61,7 @@ class Connection:
         identity = response.headers.get("ETag"), response.headers.get("Last-Modified"), given.rpartition("/")[2]
         if self._identity is not None and identity != self._identity:
             response.close()
-            raise ChangedError(f"{self.url} was changed on the server during the download: run the same command again")
+            raise DownloadError(f"{self.url} was changed on the server during the download: run the same command again")
         self._identity = identity
         return response
 

@@ -37,6 +37,7 @@ from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
 from slam.sequences.growing import GrowingSequence
+from slam.sequences.undistortion import intrinsics_of
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +74,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     source = open_source(request.source, request.wait)
     camera = calibration_of(request.source, request.camera_file, source)
     source.fps = camera.fps
-    intrinsics = StreamedSequence.intrinsics_of(camera)
+    intrinsics = intrinsics_of(camera)
     depth = open_depth(settings.depth, intrinsics, None)
     predictor = make_predictor(networks, depth, settings.depth, intrinsics)
     name = Path(request.source).stem or "live"

@@ -10,11 +10,11 @@ import numpy as np
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from slam.commands.live.reader import Arrival, Reader
 from slam.commands.live.source import Source
-from slam.frames import Frame, Image, Intrinsics
+from slam.frames import Frame
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.growing import GrowingSequence
-from slam.sequences.undistortion import Undistortion, pinhole_of
+from slam.sequences.undistortion import Undistortion, intrinsics_of
 
 
 class StreamedSequence(GrowingSequence):
@@ -37,15 +37,10 @@ class StreamedSequence(GrowingSequence):
         if every_frame and not source.is_stored:
             raise SequenceError(f"{name} does not wait while an image is measured: leave out --every-frame")
         undistortion = Undistortion(camera) if camera.is_distorted else None
-        super().__init__(self.intrinsics_of(camera), camera.height_or(None), name=name)
-        prepare = _as_they_are if undistortion is None else undistortion.apply
+        super().__init__(intrinsics_of(camera), camera.height_or(None), name=name)
+        prepare = undistortion.apply if undistortion is not None else lambda image: image
         self.reader = Reader(source, most_wait_s, prepare, every_frame)
         self.arrivals: dict[int, Arrival] = {}
-
-    @staticmethod
-    def intrinsics_of(camera: CameraFile) -> Intrinsics:
-        """Of the images without distortion."""
-        return Undistortion(camera).intrinsics if camera.is_distorted else pinhole_of(camera)
 
     def frames(self) -> Iterator[Frame]:
         """Every frame as it is taken."""
@@ -71,7 +66,3 @@ def calibration_of(camera: str, given: Path | None, source: Source) -> CameraFil
         looked = f"; no {CAMERA_FILE} is in {' or '.join(map(str, places))}" if places else ""
         raise SequenceError(f"{camera} needs its calibration: give --calibration {CAMERA_FILE} or fov=70{looked}")
     return found
-
-
-def _as_they_are(image: Image) -> Image:
-    return image

@@ -38,7 +38,6 @@ class Source(Protocol):
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
         """All images until the source ends or ``stopped`` is set; ``SequenceError`` where it dies."""
-        ...
 
 
 class FolderSource:

@@ -34,7 +34,7 @@ from slam.runtime.run_files import CONFIG, PLACES
 from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
 from slam.sequences.excerpt import frame_range
 from slam.sequences.images import ImageFiles
-from slam.sequences.undistortion import Undistortion
+from slam.sequences.undistortion import Undistortion, intrinsics_of
 
 _PLACES_TRIED = 8
 _STARTS = 3  # of these are refined
@@ -98,7 +98,7 @@ def localise(
     localiser = Localiser(
         places,
         load_stored(run.require(CONFIG), "loops").loops,
-        None if own_camera is None else _pinhole(own_camera),
+        None if own_camera is None else intrinsics_of(own_camera),
     )
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
     chosen = paths if numbers is None else [paths[number] for number in numbers]
@@ -272,7 +272,3 @@ def _camera_file(explicit: Path | None, images: Path, paths: list[Path]) -> Came
     if is_field_of_view(explicit):
         return explicit_camera(explicit, ImageFiles(in_order(paths)))
     return read_explicit(explicit)
-
-
-def _pinhole(camera: CameraFile) -> Intrinsics:
-    return Undistortion(camera).intrinsics if camera.is_distorted else Intrinsics.of(camera.pinhole)

@@ -52,13 +52,12 @@ class Noise:
 class Adjusted:
     """Cameras ``T_camera_world`` ``(K, 4, 4)``, ``points`` ``(P, 3)`` in the world, ``residual_px`` ``(S,)``.
 
-    Behind a camera the residual is infinite. ``cost`` is half the robust sum of squared residuals over sigmas.
+    Behind a camera the residual is infinite.
     """
 
     T_camera_world: FloatArray
     points: FloatArray
     residual_px: FloatArray
-    cost: float
 
 
 class BundleAdjustment:
@@ -110,7 +109,7 @@ class BundleAdjustment:
             if damping > _MOST_DAMPING:
                 break
         pixel = np.linalg.norm(residuals, axis=1) * self._noise.pixel
-        return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf), cost)
+        return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf))
 
     def residuals(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
         """Of both pixel coordinates over their sigma ``(S, 2)``."""

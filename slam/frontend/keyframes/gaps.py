@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from itertools import pairwise
 
 import numpy as np
@@ -38,8 +39,8 @@ def join_gap_ends(
         if maps[first] != maps[last] or loose.keys().isdisjoint(steps) or not T_step.keys() >= set(steps):
             continue
         begin, end = max(runs(loose.keys() & set(steps)), key=lambda run: run[1] - run[0])
-        T_first_begin = _product([T_step[k] for k in range(first, begin)])
-        T_end_last = _product([T_step[k] for k in range(end + 1, last)])
+        T_first_begin = reduce(np.matmul, (T_step[k] for k in range(first, begin)), np.eye(4))
+        T_end_last = reduce(np.matmul, (T_step[k] for k in range(end + 1, last)), np.eye(4))
         T_first_last = invert(T_map_camera[first]) @ T_map_camera[last]
         T = equal_step(invert(T_first_begin) @ T_first_last @ invert(T_end_last), end + 1 - begin)
         length = float(np.linalg.norm(T[:3, 3]))
@@ -56,10 +57,3 @@ def _chained(by_map: Sequence[RelativePose]) -> dict[int, FloatArray]:
         T_map_from = T_map_camera.setdefault(pose.from_index, np.eye(4))
         T_map_camera[pose.to_index] = T_map_from @ pose.T_from_to
     return T_map_camera
-
-
-def _product(steps: Sequence[FloatArray]) -> FloatArray:
-    T = np.eye(4)
-    for step in steps:
-        T = T @ step
-    return T

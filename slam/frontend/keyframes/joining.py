@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise
 from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.geometry.se3 import FloatArray, apply, invert
@@ -20,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 # outliers are taken out at these multiples of their limit, from a start that is still off by the drift
 _OUTLIER_LIMITS = (4.0, 2.0, 1.0)
-_ITERATIONS = 20
+_LIMITS = 20, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
 
 
 @dataclass(frozen=True)
@@ -148,21 +147,12 @@ def _renumbered(segment: MapSegment, tracks: TrackIds) -> MapSegment:
 
 def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
     """Adjust all keyframes but the first, in rounds between which outliers are taken out."""
-    noise = Noise()
+    everything = range(len(local.keyframes))
     for limit in _OUTLIER_LIMITS:
-        sightings, track_ids = local.sightings(range(len(local.keyframes)), np.isfinite(local.points[:, 0]))
-        free = np.arange(len(local.keyframes)) > 0
-        poses = np.array([keyframe.T_camera_world for keyframe in local.keyframes])
-        problem = BundleAdjustment(sightings, intrinsics, free, noise)
-        solved = problem.solve(poses, local.points[track_ids], _ITERATIONS)
-        local.points[track_ids] = solved.points
-        bad = solved.residual_px > limit * OUTLIER_PX
-        for row, keyframe in enumerate(local.keyframes):
-            gone = track_ids[sightings.point[bad & (sightings.camera == row)]]
-            local.keyframes[row] = replace(keyframe.without(gone), T_camera_world=solved.T_camera_world[row])
-        dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
-        local.points[dead] = np.nan
-        logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(poses), len(sightings), bad.sum())
+        sightings, track_ids = local.sightings(everything, np.isfinite(local.points[:, 0]))
+        gone, _ = local.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
+        outliers = sum(map(len, gone))
+        logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)
 
 
 def _kept_ratio(

@@ -156,22 +156,37 @@ class LocalMap:
         fixed = self._sharing(seen, first)
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen)
-        free = np.ones(len(chosen), np.bool_)
-        free[: max(len(fixed), 1)] = False
-        noise = Noise()
-        problem = BundleAdjustment(sightings, intrinsics, free, noise)
-        poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
+        gone, dead = self.solve(chosen, max(len(fixed), 1), sightings, track_ids, intrinsics, limits)
+        return np.concatenate([dead, gone[-1]])
+
+    def solve(
+        self,
+        chosen: Sequence[int],
+        fixed: int,
+        sightings: Sightings,
+        track_ids: TrackIds,
+        intrinsics: Intrinsics,
+        limits: tuple[int, float],
+        outlier_px: float = OUTLIER_PX,
+    ) -> tuple[list[TrackIds], TrackIds]:
+        """Adjust the chosen keyframes but the first ``fixed``, and the points that `sightings` gave of them.
+
+        Returns:
+            Tracks whose sightings were taken out of each keyframe as outliers, and those that thereby lost their point.
+        """
+        free = np.arange(len(chosen)) >= fixed
+        poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
+        problem = BundleAdjustment(sightings, intrinsics, free, Noise())
         solved = problem.solve(poses, self.points[track_ids], *limits)
         self.points[track_ids] = solved.points
-        bad = solved.residual_px > OUTLIER_PX
-        for row, k in enumerate(chosen):
-            gone = track_ids[sightings.point[bad & (sightings.camera == row)]]
-            self.keyframes[k] = replace(self.keyframes[k].without(gone), T_camera_world=solved.T_camera_world[row])
+        bad = solved.residual_px > outlier_px
+        gone = [track_ids[sightings.point[bad & (sightings.camera == row)]] for row in range(len(chosen))]
+        for k, tracks, T in zip(chosen, gone, solved.T_camera_world, strict=True):
+            self.keyframes[k] = replace(self.keyframes[k].without(tracks), T_camera_world=T)
         dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
         self.points[dead] = np.nan
-        newest = track_ids[sightings.point[bad & (sightings.camera == len(chosen) - 1)]]
-        return np.concatenate([dead, newest])
+        return gone, dead
 
     def _sharing(self, seen: NDArray[np.bool_], first: int) -> list[int]:
         """The keyframes before ``first`` that share most of the points seen."""

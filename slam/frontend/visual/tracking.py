@@ -87,7 +87,7 @@ class CornerTracker:
         """
         corners = self._state.corners.get(previous.index)
         if corners is None:
-            corners = self._filled(previous, _no_corners(), standing)
+            corners = self._filled(previous, Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64)), standing)
         forward, kept = self._tracked(previous, current, corners.pixels, predicted_flow)
         if standing is not None:
             kept &= ~nearest(resized_mask(standing, *current.grey.shape[::-1]), forward)
@@ -111,8 +111,7 @@ class CornerTracker:
 
         def find() -> Tracks:
             target = _warped(current.grey, _WINDOW_PX, predicted_flow)
-            found = self._first_flow(previous.grey, current.grey, points, [target])
-            pixels, kept = found.pixels, found.kept
+            pixels, kept = self._first_flow(previous.grey, current.grey, points, [target])
             before, now = points[kept].astype(np.float64), pixels[kept].astype(np.float64)
             return Tracks(before, now, track_ids[kept], len(kept))
 
@@ -123,11 +122,11 @@ class CornerTracker:
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
         found = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
-        if found.kept.sum() < self._config.few_corners:
+        if found[1].sum() < self._config.few_corners:
             exposed = _histogram_matched(second.grey, first.grey)
             wider = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
-            found = max(found, wider, key=lambda tracked: tracked.kept.sum())
-        return found.pixels, found.kept
+            found = max(found, wider, key=lambda tracked: tracked[1].sum())
+        return found
 
     def _filled(self, frame: Frame, arrived: Corners, standing: Mask | None) -> Corners:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
@@ -148,14 +147,16 @@ class CornerTracker:
 
     def _flow(
         self, first: Grey, second: Grey, points: Pixels, side: int, predicted_flow: PredictedFlow | None
-    ) -> _TrackedPoints:
+    ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Points ``(M, 2)`` tracked directly or through the predicted flow, and which are reliable."""
         plain = _Target(second, side, _PYRAMID_LEVELS)
         targets = [plain] if predicted_flow is None else [_warped(second, side, predicted_flow), plain]
         return self._first_flow(first, second, points, targets)
 
-    def _first_flow(self, first: Grey, second: Grey, points: Pixels, targets: Sequence[_Target]) -> _TrackedPoints:
-        """Points ``(M, 2)`` by the first target in which they pass the forward-backward check."""
+    def _first_flow(
+        self, first: Grey, second: Grey, points: Pixels, targets: Sequence[_Target]
+    ) -> tuple[Pixels, NDArray[np.bool_]]:
+        """Points ``(M, 2)`` by the first target in which they pass the forward-backward check; which do ``(M,)``."""
         pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
         for target in targets:
             tried = np.flatnonzero(~kept)
@@ -170,7 +171,7 @@ class CornerTracker:
             error = np.abs(backward - points[tried]).max(axis=1)
             returned = found_back & (error < _FORWARD_BACKWARD_PX)
             pixels[tried[returned]], kept[tried[returned]] = target.in_current(forward[returned]), True
-        return _TrackedPoints(pixels, kept & are_inside(pixels, second.shape))
+        return pixels, kept & are_inside(pixels, second.shape)
 
 
 @dataclass(frozen=True)
@@ -191,20 +192,8 @@ def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Target:
     return _Target(predicted_flow.warp_back(second), side, _PREDICTED_LEVELS, predicted_flow.in_current)
 
 
-@dataclass(frozen=True)
-class _TrackedPoints:
-    """Tracked points ``(M, 2)``, and which of them are reliable ``(M,)``."""
-
-    pixels: Pixels
-    kept: NDArray[np.bool_]
-
-
 def _histogram_matched(grey: Grey, other: Grey) -> Grey:
     """An image ``(H, W)`` with its histogram matched to that of another."""
     ranks, ranks_other = (np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (grey, other))
     levels = np.interp(ranks, ranks_other, np.arange(256.0))
     return np.asarray(cv2.LUT(grey, np.rint(levels).astype(np.uint8)))
-
-
-def _no_corners() -> Corners:
-    return Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64))

@@ -107,8 +107,9 @@ class TwoViewEstimator:
         usual = self._refined(matches, history.last, prior)
         if usual is not None and usual.agreeing.mean() >= least:
             return usual
-        by_points = cache(lambda: self._by_pnp(first, second, depth))
-        proposed = self._by_essential(first, second)
+        tolerance = _RESECTION_PX / self._focal_px
+        by_points = cache(lambda: unit_pose_by_pnp(first, second, depth, tolerance, self._seed))
+        proposed = unit_pose_by_essential(first, second, INLIER_PX / self._focal_px, self._seed)
         if history.last is None and proposed is not None:
             matches = self._with_first_sigma(matches, [proposed, by_points()])
         best = self._refined(matches, proposed, prior)
@@ -128,12 +129,6 @@ class TwoViewEstimator:
         matches = replace(matches, depth_sigma=_PATCH_WIDENING * matches.depth_sigma)
         prior = MotionPrior(start.direction, float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
         return self._refined(matches, start, prior)
-
-    def _by_essential(self, first: FloatArray, second: FloatArray) -> UnitRelativePose | None:
-        return unit_pose_by_essential(first, second, INLIER_PX / self._focal_px, self._seed)
-
-    def _by_pnp(self, first: FloatArray, second: FloatArray, depth: FloatArray) -> UnitRelativePose | None:
-        return unit_pose_by_pnp(first, second, depth, _RESECTION_PX / self._focal_px, self._seed)
 
     def _residuals(self, matches: Matches) -> Residuals:
         return Residuals(matches.rays_previous, matches.rays_current, matches.depth_previous, self._focal_px)
@@ -238,8 +233,9 @@ class TwoViewEstimator:
         """Learned over triangulated depth of corners with parallax near their epipolar lines, and that parallax."""
         distance, _ = residuals.across(unit_pose, tangent_of(unit_pose.direction))
         depth = triangulated_depth(matches.rays_previous, matches.rays_current, unit_pose)
-        rotated = _image(unit_pose.R_current_previous @ matches.rays_previous.T)
-        shift_px = np.hypot(*(matches.rays_current.T[:2] - rotated)) * self._focal_px
+        rotated = unit_pose.R_current_previous @ matches.rays_previous.T
+        shift = matches.rays_current.T[:2] - rotated[:2] / np.maximum(rotated[2], 1e-6)
+        shift_px = np.hypot(*shift) * self._focal_px
         usable = (np.abs(distance) < INLIER_PX) & (depth > 0) & (shift_px > 1.0)
         usable &= np.isfinite(matches.depth_previous)
         return np.asarray(matches.depth_previous[usable] / depth[usable]), np.asarray(shift_px[usable])
@@ -253,13 +249,3 @@ def _support(candidate: TwoViewEstimate, prior: MotionPrior) -> float:
     cosine = abs(float(prior.axis @ candidate.unit_pose.direction))
     deviation = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
     return float(candidate.agreeing.sum()) - 0.5 * deviation**2 / _OUTLIER_COST
-
-
-def _image(points: FloatArray) -> FloatArray:
-    """Points ``(3, M)`` projected to the plane z = 1, ``(2, M)``."""
-    return np.asarray(points[:2] / _ahead(points))
-
-
-def _ahead(points: FloatArray) -> FloatArray:
-    """z of points ``(3, M)``, kept positive."""
-    return np.asarray(np.maximum(points[2], 1e-6))

@@ -48,7 +48,8 @@ class Picture:
 
 def render(template: str, **values: Any) -> str:
     """A page; it holds Plotly where it has a plot."""
-    return _TEMPLATES.get_template(template).render(script=_script(), plotly=_plotly, **values)
+    script = (files("slam.results.report") / "viewer" / "page.js").read_text("utf-8")
+    return _TEMPLATES.get_template(template).render(script=script, plotly=_plotly, **values)
 
 
 def address_of(content: bytes, kind: str) -> str:
@@ -59,10 +60,6 @@ def address_of(content: bytes, kind: str) -> str:
 def packed(content: bytes) -> str:
     """What ``unpacked`` of page.js reads."""
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")
-
-
-def _script() -> str:
-    return (files("slam.results.report") / "viewer" / "page.js").read_text("utf-8")
 
 
 @cache

@@ -10,7 +10,6 @@ import numpy as np
 from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics
 from slam.frontend.drive import Keyframe
-from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.imports import import_extra
@@ -50,7 +49,8 @@ def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
         for index, T_world_camera in enumerate(result.optimised.T_world_camera):
             stream.set_time("frame", sequence=index)
             stream.set_time("time", duration=float(result.optimised.stamps[index]))
-            _log_camera(rr, stream, T_world_camera)
+            pose = rr.Transform3D(translation=T_world_camera[:3, 3], mat3x3=T_world_camera[:3, :3])
+            stream.log("world/camera", pose)
             if index in keyframes:
                 _log_images(rr, stream, keyframes[index], intrinsics, float(result.scale.per_frame[index]))
         _log_map(rr, stream, result)
@@ -58,10 +58,6 @@ def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
         stream.disconnect()
 
     write_atomically(path, fill)
-
-
-def _log_camera(rr: Any, stream: Any, T_world_camera: FloatArray) -> None:
-    stream.log("world/camera", rr.Transform3D(translation=T_world_camera[:3, 3], mat3x3=T_world_camera[:3, :3]))
 
 
 def _log_images(rr: Any, stream: Any, keyframe: Keyframe, intrinsics: Intrinsics, scale: float) -> None:

@@ -18,11 +18,10 @@ from slam.results.error_columns import (
     SNIPPET_RE,
     T_REL,
     ErrorColumn,
-    Errors,
     written,
 )
 from slam.results.metrics import CAMERA_HEIGHTS, METRES, GpsErrors, LoopsFile, Metrics, Stretch
-from slam.runtime.run_files import LOOPS, METRICS, TRAJECTORIES
+from slam.runtime.run_files import LOOPS, METRICS
 from slam.runtime.storage.record import NOT_RECORDED, Missing, known
 
 
@@ -145,14 +144,14 @@ def gps(metrics: Metrics) -> Table | None:
 
 def no_errors(metrics: Metrics) -> str:
     """Why no trajectory has an error; empty where one has, or where nothing was evaluated."""
-    values = [column.value(errors) for column in COLUMNS for errors in _evaluated(metrics).values()]
+    values = [column.value(errors) for column in COLUMNS for errors in metrics.evaluated_errors().values()]
     missing = [value.reason for value in values if isinstance(value, Missing)]
     return missing[0] if values and len(missing) == len(values) else ""
 
 
 def errors(metrics: Metrics) -> Table | None:
     """Every trajectory against the truth, a column each; None where nothing was evaluated."""
-    evaluated = _evaluated(metrics)
+    evaluated = metrics.evaluated_errors()
     if not evaluated or no_errors(metrics):
         return None
 
@@ -189,7 +188,7 @@ def alignments(metrics: Metrics) -> Table | None:
     if no_errors(metrics):
         return None
     rows: list[Sequence[Cell] | str] = []
-    for name, found in _evaluated(metrics).items():
+    for name, found in metrics.evaluated_errors().items():
         if isinstance(found.align, Missing):
             continue
         rows.append(name)
@@ -258,23 +257,15 @@ def timing(metrics: Metrics) -> Table | None:
     return Table(("stage", "time", "share", ""), rows, notes=[words])
 
 
-def _all_errors(metrics: Metrics) -> dict[str, Errors]:
-    return {name: getattr(metrics.trajectories, name) for name in TRAJECTORIES}
-
-
-def _evaluated(metrics: Metrics) -> dict[str, Errors]:
-    return {name: errors for name, errors in _all_errors(metrics).items() if not isinstance(errors, Missing)}
-
-
 def _missing_errors(metrics: Metrics) -> list[str]:
     """What of the errors is missing, by reason."""
     missing: dict[str, list[str]] = {}
     for column in COLUMNS:
-        for name, errors in _evaluated(metrics).items():
+        for name, errors in metrics.evaluated_errors().items():
             value = column.value(errors)
             if isinstance(value, Missing):
                 missing.setdefault(value.reason, []).append(f"{column.name} of {name}")
-    for name, errors in _all_errors(metrics).items():
+    for name, errors in metrics.all_errors().items():
         if isinstance(errors, Missing):
             missing.setdefault(errors.reason, []).append(f"{name} trajectory")
     return [f"{', '.join(what) if len(what) <= 4 else 'others'}: {why}" for why, what in missing.items()]

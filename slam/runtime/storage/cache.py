@@ -31,7 +31,6 @@ class Digestible(Protocol):
     @property
     def digest(self) -> bytes:
         """SHA-256."""
-        ...
 
 
 Given = str | Digestible | NDArray[Any]

@@ -91,8 +91,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    sharded = in_shards(by_label(training, config.data)[1], validation)
-    draws = _draws(training, sharded, config, (done_steps, rank), output, progress)
+    draws = _draws(training, validation, config, (done_steps, rank), output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
@@ -154,7 +153,7 @@ def _keeper(
 
 def _draws(
     training: list[Recording],
-    sharded: bool,
+    validation: list[Recording],
     config: ExperimentConfig,
     position: tuple[int, int],
     output: Path,
@@ -164,12 +163,13 @@ def _draws(
     done_steps, rank = position
     together = config.training.batch * config.training.processes
     draws, done = config.training.steps * together, done_steps * together
+    _, measured = by_label(training, config.data)
+    sharded = in_shards(measured, validation)
     if sharded and config.teacher.views == "network":
         raise ConfigError("teacher.views=network needs images as files, not in shards: name the data sets themselves")
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
     folder = config.teacher.cache or output / MEASUREMENTS
-    _, measured = by_label(training, config.data)
     many_views = measured_views(measured, config, folder, progress)
     return SnippetDraws(training, config, draws, done, rank, many_views, imitated(config))
 

@@ -61,7 +61,7 @@ class OnnxDepth:
         self.identity = f"onnx {self.sha256} {self._kind} {config.align} {numbers}"
         self.runtime = f"onnxruntime {onnxruntime.__version__}"
         self._answers: GetOrCompute = without_cache
-        self.infer(np.zeros((self._height, self._width, 3), np.uint8))
+        self._run(np.zeros((self._height, self._width, 3), np.uint8))
 
     def use_cache(self, answers: GetOrCompute) -> None:
         """Keep outputs in a cache of this network alone."""
@@ -81,6 +81,9 @@ class OnnxDepth:
         Raises:
             SlamError: the network fails, or its output is no map.
         """
+        return self._run(image)
+
+    def _run(self, image: Image) -> NDArray[np.float32]:
         resized = resize_image(image, self._height, self._width).astype(np.float32)
         values = resized / (255 * self._std) - self._mean / self._std  # (h, w, 3)
         tensor = values.transpose(2, 0, 1) if self._shape[-3] == 3 else values

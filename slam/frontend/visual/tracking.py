@@ -121,12 +121,13 @@ class CornerTracker:
         self, first: Frame, second: Frame, points: Pixels, predicted_flow: PredictedFlow | None
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
-        found = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
-        if found[1].sum() < self._config.few_corners:
+        pixels, kept = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
+        if kept.sum() < self._config.few_corners:
             exposed = _histogram_matched(second.grey, first.grey)
-            wider = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
-            found = max(found, wider, key=lambda tracked: tracked[1].sum())
-        return found
+            pixels_wide, kept_wide = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
+            if kept_wide.sum() > kept.sum():
+                return pixels_wide, kept_wide
+        return pixels, kept
 
     def _filled(self, frame: Frame, arrived: Corners, standing: Mask | None) -> Corners:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""

@@ -24,6 +24,7 @@ from erfsfm.mvs.fusion import FILE, STEP
 from erfsfm.networks.fusion_net import LEVELS, FusionNet
 from erfsfm.networks.onnx_export import exported
 from erfsfm.training.fusion_samples import FusionSamples, Sample
+from erfsfm.training.precision import has_bfloat16
 
 RECORD = "fusion.json"
 _BATCH = 8
@@ -118,7 +119,7 @@ def _optimise(net: FusionNet, data: Sequence[Sample], steps: int, seed: int, pro
         evidence, wanted, is_known = _batch([data[order.pop()] for _ in range(min(_BATCH, len(order)))])
         if rng.random() < 0.5:
             evidence, wanted, is_known = _mirrored(evidence), wanted.flip(-1), is_known.flip(-1)
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16()):
             change, log_sigma = net(evidence)
         loss = fusion_loss(change, log_sigma, wanted, is_known)
         if not torch.isfinite(loss):

@@ -42,14 +42,12 @@ from erfsfm.training.keeper import Average, Patience, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
+from erfsfm.training.precision import has_bfloat16
 from erfsfm.training.progress import StepProgress
 from erfsfm.training.reach import without_gradient
 from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
-
-_BFLOAT16 = ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16")  # capabilities of a processor
-
 
 def train(
     config: ExperimentConfig,
@@ -304,9 +302,7 @@ def _trainer(
 
 
 def _precision_on_cpu(wanted: Precision) -> Precision:
-    """What the processor computes with; without instructions for it, bfloat16 takes six times as long as float32."""
-    able = torch.cpu.get_capabilities()
-    fitting: Precision = "bf16-mixed" if any(able.get(name) for name in _BFLOAT16) else "32-true"
+    fitting: Precision = "bf16-mixed" if has_bfloat16() else "32-true"
     if wanted in ("32-true", fitting):
         return wanted
     logger.warning("training.precision %s does not fit this processor: %s is used", wanted, fitting)

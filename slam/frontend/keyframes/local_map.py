@@ -38,7 +38,6 @@ _MIN_BASELINE = 0.01
 # most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
 # ten times; but in a young map, depth and motion change together for long at hardly any cost
 _LIMITS, _YOUNG_LIMITS = (12, 1e-3), (60, 1e-6)
-_LOOSE = np.cos(np.deg2rad(float(__import__("os").environ.get("LOOSE", "1.0"))))
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
@@ -61,7 +60,6 @@ class TrackedKeyframe:
     learned_depth: FloatArray
     descriptors: Descriptors
     grey: Grey | None
-    unit: float = 1.0
 
     def with_depth(self, depth: DepthMap) -> TrackedKeyframe:
         """The same with learned depth ``(H, W)`` at its corners."""
@@ -134,38 +132,6 @@ class LocalMap:
         good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX) & self._has_baseline(T, row, len(track_ids))
         self.points[track_ids[good]] = X[good]
 
-    def born(self, keyframe: TrackedKeyframe, intrinsics: Intrinsics) -> None:
-        """Points of a keyframe's tracks that have none, where learned depth has them."""
-        new = ~self.known(keyframe.track_ids) & np.isfinite(keyframe.learned_depth) & (keyframe.learned_depth > 0)
-        rays = intrinsics.rays(keyframe.pixels[new]) * (keyframe.unit * keyframe.learned_depth[new, None])
-        self.points[keyframe.track_ids[new]] = apply(invert(keyframe.T_camera_world), rays)
-
-    def unit_of(self, keyframe: TrackedKeyframe) -> float:
-        """Of the map per learned depth, by a keyframe's points with parallax; that of the keyframe before with few."""
-        if __import__("os").environ.get("UNIT") == "0":
-            return 1.0
-        recent = LocalMap(self.keyframes[-15:], self.points)
-        tracks = keyframe.track_ids
-        depth = apply(keyframe.T_camera_world, self.points[tracks])[:, 2]
-        sure = recent.settled()[tracks] & np.isfinite(keyframe.learned_depth) & (keyframe.learned_depth > 0) & (depth > 0)
-        if sure.sum() >= 10:
-            return float(np.median(depth[sure] / keyframe.learned_depth[sure]))
-        return self.keyframes[-2].unit if len(self.keyframes) > 1 else 1.0
-
-    def settled(self) -> NDArray[np.bool_]:
-        """Which points ``(N,)`` have parallax among the keyframes."""
-        centre = np.full_like(self.points, np.nan)
-        cosine = np.ones(len(self.points))
-        for keyframe in self.keyframes:
-            tracks = keyframe.track_ids[self.known(keyframe.track_ids)]
-            camera = invert(keyframe.T_camera_world)[:3, 3]
-            fresh = tracks[np.isnan(centre[tracks, 0])]
-            centre[fresh] = camera
-            first, now = self.points[tracks] - centre[tracks], self.points[tracks] - camera
-            found = (first * now).sum(axis=1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(now, axis=1))
-            cosine[tracks] = np.minimum(cosine[tracks], found)
-        return cosine < _LOOSE
-
     def _has_baseline(self, T_camera_world: FloatArray, row: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
         """Which of ``count`` tracks are seen from places far enough apart; sightings are of tracks ``row``."""
         newest = self.keyframes[-1]
@@ -228,34 +194,19 @@ class LocalMap:
         best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
         return sorted(k for _, k in best)
 
-    def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_], learned: bool = True) -> tuple[Sightings, TrackIds]:
+    def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
-        cameras, track_ids, pixels, depths = [], [], [], []
+        cameras, track_ids, pixels = [], [], []
         for row, k in enumerate(chosen):
             keyframe = self.keyframes[k]
             known = seen[keyframe.track_ids]
             cameras.append(np.full(int(known.sum()), row))
             track_ids.append(keyframe.track_ids[known])
             pixels.append(keyframe.pixels[known])
-            depths.append(keyframe.unit * keyframe.learned_depth[known] if learned else np.full(int(known.sum()), np.nan))
-        depth = np.concatenate(depths)
         camera, track, pixel = np.concatenate(cameras), np.concatenate(track_ids), np.concatenate(pixels)
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
-        camera, pixel, depth = camera[twice], pixel[twice], depth[twice]
-        centres = invert(np.array([self.keyframes[k].T_camera_world for k in chosen]))[:, :3, 3]
-        towards = centres[camera] - self.points[points][row_of]
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        _, first = np.unique(row_of, return_index=True)
-        cosine = np.ones(len(points))
-        np.minimum.at(cosine, row_of, (towards * towards[first][row_of]).sum(axis=1))
-        if not learned:
-            T = np.array([self.keyframes[k].T_camera_world for k in chosen])
-            X = self.points[points][row_of]
-            depth = np.einsum("sj,sj->s", T[camera, 2, :3], X) + T[camera, 2, 3]
-            depth = np.where(depth > 0, depth, np.nan)
-        depth = np.where(cosine[row_of] > _LOOSE, depth, np.nan)
-        return Sightings(camera, row_of, pixel, depth), points
+        return Sightings(camera[twice], row_of, pixel[twice]), points
 
     def aligned(
         self,

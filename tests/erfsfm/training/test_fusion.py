@@ -44,7 +44,19 @@ def test_the_loss_is_least_at_the_truth_and_where_the_sigma_is_the_error() -> No
 
 
 @pytest.mark.slow
-def test_a_network_is_trained_on_worlds_and_refines_a_run(tmp_path: Path, command_line: Cli) -> None:
+def test_a_network_is_trained_on_worlds_and_refines_a_run(
+    tmp_path: Path, command_line: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a processor that does not compute with bfloat16, training does not either."""
+    forward, in_bfloat16 = FusionNet.forward, set()
+
+    def recorded(net: FusionNet, evidence: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        if net.training:
+            in_bfloat16.add(torch.is_autocast_enabled("cpu"))
+        return forward(net, evidence)
+
+    monkeypatch.setattr(FusionNet, "forward", recorded)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict)
     for seed in (3, 4):
         simulate = ["simulate", str(tmp_path / f"{seed}"), "--seed", str(seed), "--frames", "20", "--route", "grid"]
         subprocess.run([sys.executable, "-m", "slam", *simulate, "--depth"], check=True, capture_output=True)
@@ -53,6 +65,7 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(tmp_path: Path, comman
     code, out, _ = command_line(main, "erfsfm", *words, "--json")
     (metrics,) = json.loads(out)
     assert code == 0 and metrics["fused_mean"] < metrics["guess_mean"]
+    assert in_bfloat16 == {False}
     run = ["run", "--dataset", str(tmp_path / "4"), "--weights", "sim", "--set", f"depth.fusion={tmp_path / 'net'}"]
     done = subprocess.run([sys.executable, "-m", "slam", *run, "--output", str(tmp_path / "run")], capture_output=True)
     assert done.returncode == 0, done.stderr

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
@@ -203,10 +204,11 @@ def test_without_a_ground_plane_lengths_stay_unscaled_with_a_reason() -> None:
     assert result.optimised.length_m == pytest.approx(FACTOR * turning_length(20), rel=1e-3)
 
 
-def threads() -> set[str]:
-    """Names of the threads that a run starts and must end, of those that are alive."""
+def threads(before: Collection[threading.Thread]) -> set[str]:
+    """Names of the threads that a run starts and must end, of those that are alive and were not there ``before``."""
     prefixes = ("networks", "oracle", "beside", "ahead", "side")
-    return {thread.name for thread in threading.enumerate() if thread.name.startswith(prefixes)}
+    alive = (thread for thread in threading.enumerate() if thread not in before)
+    return {thread.name for thread in alive if thread.name.startswith(prefixes)}
 
 
 def test_a_result_holds_neither_threads_nor_networks(tiny_weights: Path) -> None:
@@ -214,11 +216,12 @@ def test_a_result_holds_neither_threads_nor_networks(tiny_weights: Path) -> None
     networks = DepthPosePredictor.from_weights(tiny_weights)
     predictor = NetworkPredictor(networks, street.intrinsics)
     during: set[str] = set()
+    before = threading.enumerate()  # other tests may have left some
     pipeline = SlamPipeline(
-        street, predictor, load_config(None, ["mapping.enabled=false"]), lambda *_: during.update(threads())
+        street, predictor, load_config(None, ["mapping.enabled=false"]), lambda *_: during.update(threads(before))
     )
     result = pipeline.run()
-    assert {"networks_0", "beside_0"} <= during and threads() == set()
+    assert {"networks_0", "beside_0"} <= during and threads(before) == set()
     alive = weakref.ref(predictor), weakref.ref(networks)
     del pipeline, predictor, networks
     gc.collect()
@@ -234,9 +237,10 @@ def test_threads_end_where_a_run_fails() -> None:
             raise RuntimeError("out of memory")
         return road(index)
 
+    before = threading.enumerate()
     with pytest.raises(RuntimeError, match="out of memory"):
         run(LevelRoad(turning(30)), depth_of=fails)
-    assert threads() == set()
+    assert threads(before) == set()
 
 
 def speckled() -> Image:

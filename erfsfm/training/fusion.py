@@ -113,13 +113,14 @@ def _optimise(net: FusionNet, data: Sequence[Sample], steps: int, seed: int, pro
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)
     order: list[int] = []
+    in_bfloat16 = has_bfloat16()
     for step in range(steps):
         if len(order) < _BATCH:
             order = rng.permutation(len(data)).tolist()
         evidence, wanted, is_known = _batch([data[order.pop()] for _ in range(min(_BATCH, len(order)))])
         if rng.random() < 0.5:
             evidence, wanted, is_known = _mirrored(evidence), wanted.flip(-1), is_known.flip(-1)
-        with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16()):
+        with torch.autocast("cpu", torch.bfloat16, enabled=in_bfloat16):
             change, log_sigma = net(evidence)
         loss = fusion_loss(change, log_sigma, wanted, is_known)
         if not torch.isfinite(loss):

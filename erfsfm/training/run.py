@@ -49,6 +49,7 @@ from erfsfm.training.supervision import imitated, measured_views, seen_by_imitat
 
 logger = logging.getLogger(__name__)
 
+
 def train(
     config: ExperimentConfig,
     output: Path,
@@ -302,6 +303,7 @@ def _trainer(
 
 
 def _precision_on_cpu(wanted: Precision) -> Precision:
+    """What the processor computes with."""
     fitting: Precision = "bf16-mixed" if has_bfloat16() else "32-true"
     if wanted in ("32-true", fitting):
         return wanted

@@ -17,7 +17,7 @@ from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.keyframes.unit import evened, learned_unit
+from slam.frontend.keyframes.unit import pieces, learned_unit
 from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
@@ -93,7 +93,7 @@ class KeyframeTracking:
         """Look for the camera among all keyframes of the map in which it was lost."""
         if self._places is None:
             T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
-            self._places = Relocaliser(views_of(lost), T_map_camera, self._intrinsics, self._seed)
+            self._places = Relocaliser(views_of(lost, False), T_map_camera, self._intrinsics, self._seed)
         corners = new_corners(frame.grey, np.zeros((0, 2), np.float32), self._config.max_corners)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
         found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
@@ -148,7 +148,7 @@ class KeyframeTracking:
         self.choose(drive)
         if self._odometry is None or self._front_end == "both":
             return ()
-        return tuple(evened(each.copy(), self._intrinsics) for each in self._odometry.segments if each.started)
+        return tuple(piece for each in self._odometry.segments if each.started for piece in pieces(each.copy(), self._intrinsics))
 
     @property
     def events(self) -> Sequence[TrackingEvent]:

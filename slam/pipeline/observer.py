@@ -220,6 +220,7 @@ class Observer:
 
     def _process(self, pending: PendingFrame) -> None:
         frame = pending.frame
+        self._finish_tasks("depth network")
         with self._stopwatch.stage("keyframes"):
             self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):

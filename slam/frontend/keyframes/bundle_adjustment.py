@@ -27,7 +27,7 @@ _BLOCK = 512
 
 @dataclass(frozen=True)
 class Sightings:
-    """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``.
+    """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, learned ``depth`` ``(S,)`` or NaN.
 
     A point is seen at most once by a camera.
     """
@@ -35,6 +35,7 @@ class Sightings:
     camera: NDArray[np.int64]
     point: NDArray[np.int64]
     pixels: FloatArray
+    depth: FloatArray
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -46,6 +47,7 @@ class Noise:
 
     pixel: float = 0.7
     huber: float = 1.5
+    depth: float = float(__import__("os").environ.get("DSIG", "0.3"))
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,9 @@ class BundleAdjustment:
         self._focal = np.array([intrinsics.fx, intrinsics.fy])
         self._rays = intrinsics.rays(sightings.pixels)[:, :2]
         self._noise = noise
+        self._log_depth = np.log(sightings.depth)
+        self._learned = np.isfinite(self._log_depth)
+        self._log_depth[~self._learned] = 0.0
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
@@ -108,20 +113,26 @@ class BundleAdjustment:
             damping *= 10.0
             if damping > _MOST_DAMPING:
                 break
-        pixel = np.linalg.norm(residuals, axis=1) * self._noise.pixel
+        pixel = np.linalg.norm(residuals[:, :2], axis=1) * self._noise.pixel
         return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf))
 
     def residuals(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
         """Of both pixel coordinates over their sigma ``(S, 2)``."""
         X = self._in_cameras(T_camera_world, points)
         z = np.maximum(X[:, 2:], _LEAST_DEPTH)
-        return np.asarray((X[:, :2] / z - self._rays) * self._focal / self._noise.pixel)
+        found = np.empty((len(X), 3))
+        found[:, :2] = (X[:, :2] / z - self._rays) * self._focal / self._noise.pixel
+        found[:, 2] = self._learned * (np.log(z[:, 0]) - self._log_depth) / self._noise.depth
+        return found
 
     def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the residuals by their camera's perturbation ``(6, 2, S)`` and their point ``(3, 2, S)``."""
         X = self._in_cameras(T_camera_world, points)
-        by_camera = pixel_jacobian(X, self._focal / self._noise.pixel)
-        by_point = np.empty((3, 2, len(X)))
+        by_camera = np.zeros((6, 3, len(X)))
+        by_camera[:, :2] = pixel_jacobian(X, self._focal / self._noise.pixel)
+        scale = self._learned / (self._noise.depth * np.maximum(X[:, 2], _LEAST_DEPTH))
+        by_camera[0, 2], by_camera[1, 2], by_camera[5, 2] = X[:, 1] * scale, -X[:, 0] * scale, scale
+        by_point = np.empty((3, 3, len(X)))
         for T, rows in zip(T_camera_world, self._rows, strict=True):
             by_point[..., rows] = np.tensordot(T[:3, :3].T, by_camera[3:, :, rows], 1)
         return by_camera, by_point
@@ -137,13 +148,17 @@ class BundleAdjustment:
 
     def _cost(self, residuals: FloatArray) -> float:
         """Huber's."""
-        length, k = np.linalg.norm(residuals, axis=1), self._noise.huber
+        length, k = self._lengths(residuals), self._noise.huber
         return float(np.where(length < k, 0.5 * length**2, k * (length - 0.5 * k)).sum())
+
+    def _lengths(self, residuals: FloatArray) -> FloatArray:
+        return np.stack([np.linalg.norm(residuals[:, :2], axis=1), np.abs(residuals[:, 2])], axis=1)
 
     def weights(self, residuals: FloatArray) -> FloatArray:
         """Square roots of Huber's weights ``(S, 1)``."""
-        length = np.linalg.norm(residuals, axis=1, keepdims=True)
-        return np.asarray(np.sqrt(np.minimum(self._noise.huber / np.maximum(length, 1e-12), 1.0)))
+        length = self._lengths(residuals)
+        root = np.sqrt(np.minimum(self._noise.huber / np.maximum(length, 1e-12), 1.0))
+        return np.asarray(root[:, [0, 0, 1]])
 
     def _moved(
         self, T_camera_world: FloatArray, points: FloatArray, by_camera: FloatArray, by_point: FloatArray
@@ -208,7 +223,7 @@ class _System:
     @classmethod
     def of(cls, problem: BundleAdjustment, T: FloatArray, X: FloatArray, residuals: FloatArray) -> _System:
         root = problem.weights(residuals)
-        A, B = (root[:, 0] * J for J in problem.jacobians(T, X))
+        A, B = (root.T * J for J in problem.jacobians(T, X))
         r = (root * residuals).T
         of_cameras = [
             (A[..., rows].reshape(6, -1), r[:, rows].ravel())
@@ -221,7 +236,7 @@ class _System:
             point_side[:, i] = -np.bincount(point, (B[i] * r).sum(axis=0), points)
             for j in range(i + 1):
                 V[:, i, j] = V[:, j, i] = np.bincount(point, (B[i] * B[j]).sum(axis=0), points)
-        W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1]
+        W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1] + A[:, None, 2] * B[:, 2]
         U = np.array([J @ J.T for J, _ in of_cameras])
         camera_side = np.array([-J @ residual for J, residual in of_cameras])
         return cls(problem._blocks, U, V, W, camera_side, point_side)

@@ -23,11 +23,12 @@ _LEAST_PIXEL_SIGMA = 0.1
 # below this inlier ratio the pose may be one that some wrong tracks agree on
 _DOUBTFUL_RATIO = 0.75
 _SAMPLES = 300
+_PIXEL_SIGMA = 0.7  # of a sighting
 
 
 @dataclass(frozen=True)
 class CameraPose:
-    """``T_camera_world``, ``residual_px`` ``(M,)``, infinite behind the camera, and ``sigmas`` ``(6,)``.
+    """``T_camera_world``, ``residual_px`` ``(M,)``, infinite behind the camera, without what uncertain depth explains, and ``sigmas`` ``(6,)``.
 
     The sigmas are of a perturbation on the left, rotation first, for known points and independent errors.
     """
@@ -43,6 +44,7 @@ def resect(
     pixels: FloatArray,
     intrinsics: Intrinsics,
     seed: int = 0,
+    spread: FloatArray | None = None,
 ) -> CameraPose:
     """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
 
@@ -54,46 +56,75 @@ def resect(
         pixels: of the points ``(M, 2)``.
         intrinsics: of the camera.
         seed: of RANSAC.
+        spread: one sigma of each point ``(M, 3)``, along the ray on which its depth is uncertain; None if all are exact.
     """
+    spread = np.zeros_like(points) if spread is None else spread
 
     def support(pose: CameraPose) -> int:
         return int((pose.residual_px < INLIER_PX).sum())
 
-    best = _refined(guesses[0], points, pixels, intrinsics)
+    best = _refined(guesses[0], points, spread, pixels, intrinsics)
     for guess in guesses[1:]:
         if support(best) >= _DOUBTFUL_RATIO * len(points):
             break
-        best = max(best, _refined(guess, points, pixels, intrinsics), key=support)
+        best = max(best, _refined(guess, points, spread, pixels, intrinsics), key=support)
     if support(best) < _DOUBTFUL_RATIO * len(points):
         found = consensus(points, pixels, intrinsics.K, _SAMPLES, INLIER_PX, seed)
         if found is not None:
             start = make(cv2.Rodrigues(found[0])[0], found[1])
-            best = max(best, _refined(start, points, pixels, intrinsics), key=support)
+            best = max(best, _refined(start, points, spread, pixels, intrinsics), key=support)
     return best
 
 
-def _refined(T_camera_world: FloatArray, points: FloatArray, pixels: FloatArray, intrinsics: Intrinsics) -> CameraPose:
+def _refined(
+    T_camera_world: FloatArray, points: FloatArray, spread: FloatArray, pixels: FloatArray, intrinsics: Intrinsics
+) -> CameraPose:
     """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
     T = T_camera_world.copy()
     focal = np.array([intrinsics.fx, intrinsics.fy])
     rays = intrinsics.rays(pixels)[:, :2]
     residual, X = _residual(T, points, rays, focal)
+    J = pixel_jacobian(X, focal)
+    whitened = _Whitening.of(J, T, spread)
+    residual = whitened(residual)
     for _ in range(_ITERATIONS):
         norm = np.hypot(*residual)
         scale = max(0.5 * INLIER_PX, float(np.median(norm)))
         weight = np.where(X[:, 2] > LEAST_DEPTH, 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
-        J = pixel_jacobian(X, focal)
+        J = whitened(J)
         weighted = (weight * J).reshape(6, -1)
         information = weighted @ J.reshape(6, -1).T + 1e-9 * np.eye(6)
         step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
         T = from_rotation_vector(step[:3], step[3:]) @ T
         residual, X = _residual(T, points, rays, focal)
+        J = pixel_jacobian(X, focal)
+        whitened = _Whitening.of(J, T, spread)
+        residual = whitened(residual)
         if np.abs(step).max() < _CONVERGED:
             break
     in_front = X[:, 2] > LEAST_DEPTH
     sigma = max(mad_sigma(residual), _LEAST_PIXEL_SIGMA)
     sigmas = sigma * np.sqrt(np.diag(np.linalg.inv(information)))
     return CameraPose(T, np.where(in_front, np.hypot(*residual), np.inf), sigmas)
+
+
+@dataclass(frozen=True)
+class _Whitening:
+    """Of pixels: along ``direction`` ``(2, M)`` those of uncertain points count less, by ``less`` ``(M,)``."""
+
+    direction: FloatArray
+    less: FloatArray
+
+    @classmethod
+    def of(cls, J: FloatArray, T_camera_world: FloatArray, spread: FloatArray) -> _Whitening:
+        direction = np.einsum("ism,im->sm", J[3:], T_camera_world[:3, :3] @ spread.T)
+        square = np.maximum((direction**2).sum(axis=0), 1e-9)
+        return cls(direction, (1.0 - _PIXEL_SIGMA / np.sqrt(_PIXEL_SIGMA**2 + square)) / square)
+
+    def __call__(self, pixels: FloatArray) -> FloatArray:
+        """Pixels ``(..., 2, M)`` in pixels of equal certainty."""
+        along = self.less * (pixels * self.direction).sum(axis=-2)
+        return np.asarray(pixels - along[..., None, :] * self.direction)
 
 
 def _residual(

@@ -38,6 +38,10 @@ _MIN_BASELINE = 0.01
 # most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
 # ten times; but in a young map, depth and motion change together for long at hardly any cost
 _LIMITS, _YOUNG_LIMITS = (12, 1e-3), (60, 1e-6)
+_LOOSE = np.deg2rad(float(__import__("os").environ.get("LOOSE", "1.0")))
+_PIXEL, _DEPTH_SIGMA = 0.7, float(__import__("os").environ.get("RSIG", "0.3"))
+_LEAST_SETTLED = 20
+_G = float(__import__('os').environ.get('G', '0.9'))
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
@@ -132,6 +136,42 @@ class LocalMap:
         good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX) & self._has_baseline(T, row, len(track_ids))
         self.points[track_ids[good]] = X[good]
 
+    def born(self, keyframe: TrackedKeyframe, intrinsics: Intrinsics) -> None:
+        """Points of a keyframe's tracks that have none, where learned depth has them."""
+        learned = np.isfinite(keyframe.learned_depth) & (keyframe.learned_depth > 0)
+        known = self.known(keyframe.track_ids)
+        both = learned & known
+        depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
+        recent = LocalMap(self.keyframes[-15:], self.points)
+        unit = unit_of(depth[both] / keyframe.learned_depth[both], recent.settled()[keyframe.track_ids][both])
+        new = learned & ~known
+        rays = intrinsics.rays(keyframe.pixels[new]) * (unit * keyframe.learned_depth[new, None])
+        self.points[keyframe.track_ids[new]] = apply(invert(keyframe.T_camera_world), rays)
+
+    def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> tuple[FloatArray, FloatArray]:
+        """The first centre from which keyframes see each point ``(N, 3)``, and the angle of their rays to it ``(N,)``."""
+        centre, cosine = np.full_like(self.points, np.nan), np.ones(len(self.points))
+        for keyframe in keyframes:
+            tracks = keyframe.track_ids[self.known(keyframe.track_ids)]
+            camera = invert(keyframe.T_camera_world)[:3, 3]
+            fresh = tracks[np.isnan(centre[tracks, 0])]
+            centre[fresh] = camera
+            first, now = self.points[tracks] - centre[tracks], self.points[tracks] - camera
+            found = (first * now).sum(axis=1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(now, axis=1))
+            cosine[tracks] = np.minimum(cosine[tracks], found)
+        return centre, np.arccos(np.clip(cosine, -1.0, 1.0))
+
+    def settled(self) -> NDArray[np.bool_]:
+        """Which points ``(N,)`` have parallax among the keyframes."""
+        return self.parallax(self.keyframes)[1] > _LOOSE
+
+    def spread(self, track_ids: TrackIds, intrinsics: Intrinsics) -> FloatArray:
+        """One sigma of points ``(M, 3)``, along the ray from which they were seen first."""
+        centre, angle = self.parallax(self.keyframes[-20:])
+        sigma = np.minimum(_PIXEL / (intrinsics.fx * np.maximum(angle[track_ids], 1e-9)), _DEPTH_SIGMA)
+        along = sigma[:, None] * (self.points[track_ids] - centre[track_ids])
+        return np.where(np.isnan(along), 0.0, along)
+
     def _has_baseline(self, T_camera_world: FloatArray, row: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
         """Which of ``count`` tracks are seen from places far enough apart; sightings are of tracks ``row``."""
         newest = self.keyframes[-1]
@@ -196,17 +236,30 @@ class LocalMap:
 
     def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
-        cameras, track_ids, pixels = [], [], []
+        cameras, track_ids, pixels, depths = [], [], [], []
         for row, k in enumerate(chosen):
             keyframe = self.keyframes[k]
             known = seen[keyframe.track_ids]
             cameras.append(np.full(int(known.sum()), row))
             track_ids.append(keyframe.track_ids[known])
             pixels.append(keyframe.pixels[known])
+            depths.append(keyframe.learned_depth[known])
+        depth = np.concatenate(depths)
         camera, track, pixel = np.concatenate(cameras), np.concatenate(track_ids), np.concatenate(pixels)
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
-        return Sightings(camera[twice], row_of, pixel[twice]), points
+        camera, pixel, depth = camera[twice], pixel[twice], depth[twice]
+        settled = self.parallax([self.keyframes[k] for k in chosen])[1][points][row_of] > _LOOSE
+        T = np.array([self.keyframes[k].T_camera_world for k in chosen])
+        X = self.points[points][row_of]
+        ratio = (np.einsum("sj,sj->s", T[camera, 2, :3], X) + T[camera, 2, 3]) / depth
+        for row in range(len(chosen)):
+            own = (camera == row) & np.isfinite(ratio) & (ratio > 0)
+            loose = own & ~settled
+            if loose.any():
+                depth[loose] *= np.median(ratio[loose]) ** (1.0 if (own & settled).sum() >= _LEAST_SETTLED else _G)
+        depth = np.where(~settled & (depth > 0), depth, np.nan)
+        return Sightings(camera, row_of, pixel, depth), points
 
     def aligned(
         self,
@@ -271,6 +324,13 @@ class LocalMap:
         near = np.flatnonzero((distance < _NEAR_DEPTHS) & (cosine > _NEAR_COSINE))
         order = np.argsort((distance + 2.0 * (1.0 - cosine))[near], kind="stable")
         return [kept[k] for k in near[order]]
+
+
+def unit_of(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
+    """Of depth in a map per learned depth, by the points with parallax if there are enough."""
+    if settled.sum() >= _LEAST_SETTLED:
+        return float(np.median(ratios[settled]))
+    return float(np.median(ratios)) ** _G if len(ratios) >= _LEAST_SETTLED else 1.0
 
 
 def _matched(

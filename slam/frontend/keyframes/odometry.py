@@ -41,6 +41,8 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
+_FEW = float(__import__("os").environ.get("FEW", "2"))
+_YOUNG, _YOUNG_PARALLAX_RATIO = 4, 0.0125
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
 
 
@@ -158,6 +160,17 @@ class KeyframeOdometry:
         for row, keyframe in list(enumerate(keyframes))[-2:]:
             if keyframe.index == frame.index:
                 keyframes[row] = keyframe.with_depth(depth)
+                if row == len(keyframes) - 1:
+                    self._bear(self._state.segments[-1], keyframes[row])
+
+    def _bear(self, segment: MapSegment, keyframe: TrackedKeyframe) -> None:
+        if segment.map.known(keyframe.track_ids).mean() < _FEW:
+            segment.map.born(keyframe, self._intrinsics)
+        if not segment.started and segment.map.known(keyframe.track_ids).sum() >= MIN_POINTS:
+            segment.started = True
+            for before in self._state.segments[:-1]:
+                before.map.forget_images()
+            self._note(keyframe.index, "map begun", support=int(segment.map.known(keyframe.track_ids).sum()))
 
     def is_keyframe(self, index: int) -> bool:
         """Whether that frame is the last keyframe."""
@@ -290,8 +303,8 @@ class KeyframeOdometry:
             return None
         T_last = self._state.T_camera_world
         guesses = T_last, self._state.T_last_step @ T_last
-        points = segment.map.points[track_ids]
-        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed)
+        points, spread = segment.map.points[track_ids], segment.map.spread(track_ids, self._intrinsics)
+        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
     def _wants_keyframe(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> bool:
@@ -301,7 +314,8 @@ class KeyframeOdometry:
         before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
         R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
         rays_before, rays = self._intrinsics.rays(before), self._intrinsics.rays(pixels.astype(np.float64))
-        limit = _KEYFRAME_PARALLAX_RATIO * self._intrinsics.width
+        young = len(segment.map.keyframes) < _YOUNG
+        limit = (_YOUNG_PARALLAX_RATIO if young else _KEYFRAME_PARALLAX_RATIO) * self._intrinsics.width
         moved = float(np.median(np.linalg.norm(pixels - before, axis=1)))
         parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))
         return parallax > limit or moved > _MOST_FLOW * limit

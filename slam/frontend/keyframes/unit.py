@@ -7,9 +7,10 @@ off, and every point fits. Learned depth errs more in a single image, but alike 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from slam.frames import Intrinsics
+from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
 from slam.frontend.keyframes.joining import moved
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.map_segment import MapSegment
@@ -23,6 +24,7 @@ _LEARNED_SIGMA = 0.3  # of a keyframe's unit by learned depth, logarithm: its ne
 # sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and from the first keyframe
 # to the last where learned depth is not needed
 _BEGUN, _EXACT = 0.03, 0.1
+_SETTLED, _LEAST_KEYFRAMES = float(__import__("os").environ.get("SETTLED", "10")), 4
 
 
 def learned_unit(local: LocalMap) -> float:
@@ -31,27 +33,48 @@ def learned_unit(local: LocalMap) -> float:
     return float(np.median(joined)) if len(joined) >= _LEAST_DEPTHS else 1.0
 
 
-def evened(segment: MapSegment, intrinsics: Intrinsics) -> MapSegment:
-    """The map with one unit from its first keyframe to its last; itself where its points carry the unit."""
+def pieces(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
+    """The map in parts through each of which points carry one unit; what lies between them are turns."""
     local = segment.map
+    keyframes = local.keyframes
     variance = _carried(local, intrinsics)
-    if len(variance) == 0 or np.sqrt(variance.sum()) < _EXACT:
-        return segment
-    ratios = [_ratios(local, keyframe) for keyframe in local.keyframes]
-    known = np.array([len(each) >= _LEAST_DEPTHS for each in ratios])
-    if not known.any():
-        return segment
-    measured = np.array([np.log(np.median(each)) if is_known else 0.0 for each, is_known in zip(ratios, known)])
-    weight, link = known / _LEARNED_SIGMA**2, 1.0 / variance
-    bands = np.zeros((2, len(ratios)))
-    bands[0] = weight + np.append(link, 0.0) + np.append(0.0, link)
-    bands[1, :-1] = -link
-    unit = solveh_banded(bands, weight * measured, lower=True)
-    scales = np.exp(unit - np.median(unit))
-    T_world_camera = invert(np.array([keyframe.T_camera_world for keyframe in local.keyframes]))
-    steps = scales[:-1, None] * np.diff(T_world_camera[:, :3, 3], axis=0)
-    T_world_camera[1:, :3, 3] = T_world_camera[0, :3, 3] + np.cumsum(steps, axis=0)
-    return moved(segment, T_world_camera, scales)
+    strong = variance < float(__import__('os').environ.get('CUT', '0.05')) ** 2
+    if __import__('os').environ.get('MODE') == 'count':
+        strong = np.array([LocalMap(keyframes[max(k - 15, 0) : k], local.points).settled()[keyframes[k].track_ids].sum() >= 20 for k in range(1, len(keyframes))], np.bool_)
+    part = np.concatenate([[0], np.cumsum(~strong)])
+    runs = [rows for number in range(part[-1] + 1) if len(rows := np.flatnonzero(part == number)) >= _LEAST_KEYFRAMES]
+    if not runs:
+        return [segment]
+    inside = np.full(len(keyframes), -1)
+    for number, rows in enumerate(runs):
+        inside[rows] = number
+    starts = np.array([keyframe.index for keyframe in keyframes])
+    found = [MapSegment(LocalMap([keyframes[k] for k in rows], local.points), [], True, []) for rows in runs]
+    T_before = keyframes[0].T_camera_world
+    ends = [(k, keyframes[k].index, keyframes[k].T_camera_world) for k in range(len(keyframes))]
+    moves = [(k - 1, index, T) for k, index, T in ends[1:] if inside[k] < 0 or inside[k] != inside[k - 1]]
+    known = {keyframe.index for keyframe in keyframes}
+    last = 0
+    for frame in segment.frames:
+        k = int(np.searchsorted(starts, frame.index, side="right")) - 1
+        if k >= 0 and inside[k] >= 0:
+            found[inside[k]].frames.append(frame)
+        elif k >= 0 and frame.T_camera_world is not None and frame.index not in known:
+            moves.append((k, frame.index, frame.T_camera_world))
+    for k, index, T_camera_world in sorted(moves, key=lambda move: move[1]):
+        number = max((inside[j] for j in range(k + 1) if inside[j] >= 0), default=0)
+        found[number].turns.append(_turn(keyframes[k], index, T_camera_world))
+    found[0].turns[:0] = [turn for turn in segment.turns if turn.to_index <= starts[0]]
+    found[-1].turns.extend(turn for turn in segment.turns if turn.to_index > starts[0])
+    return found
+
+
+def _turn(keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray) -> RelativePose:
+    T = keyframe.T_camera_world @ invert(T_camera_world)
+    known = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
+    depth = float(np.median(known)) if len(known) else 1.0
+    length = 0.01 * depth + 0.2 * float(np.linalg.norm(T[:3, 3]))
+    return RelativePose(keyframe.index, index, T, np.repeat([np.deg2rad(0.1), length], 3), KEYFRAME_SOURCE)
 
 
 def _carried(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:

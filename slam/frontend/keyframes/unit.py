@@ -63,14 +63,18 @@ def pieces(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
             moves.append((k, frame.index, frame.T_camera_world))
     for k, index, T_camera_world in sorted(moves, key=lambda move: move[1]):
         number = max((inside[j] for j in range(k + 1) if inside[j] >= 0), default=0)
-        found[number].turns.append(_turn(keyframes[k], index, T_camera_world))
+        found[number].turns.append(_turn(local, keyframes[k], index, T_camera_world))
     found[0].turns[:0] = [turn for turn in segment.turns if turn.to_index <= starts[0]]
     found[-1].turns.extend(turn for turn in segment.turns if turn.to_index > starts[0])
     return found
 
 
-def _turn(keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray) -> RelativePose:
+def _turn(local: LocalMap, keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray) -> RelativePose:
+    """From a keyframe to a later camera in the unit of learned depth."""
     T = keyframe.T_camera_world @ invert(T_camera_world)
+    ratios = _ratios(local, keyframe)
+    if len(ratios) >= _LEAST_DEPTHS:
+        T[:3, 3] *= np.median(ratios)
     known = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
     depth = float(np.median(known)) if len(known) else 1.0
     length = 0.01 * depth + 0.2 * float(np.linalg.norm(T[:3, 3]))

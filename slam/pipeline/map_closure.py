@@ -99,7 +99,7 @@ def close_maps(maps: Sequence[MapSegment], intrinsics: Intrinsics, config: SlamC
 def views_of(local: LocalMap, settled: bool = True) -> list[View]:
     """The keyframes of a map: corners with their points in the camera."""
     found = []
-    world = np.where(local.settled()[:, None], local.points, np.nan) if settled else local.points
+    world = np.where(local.parallax().settled[:, None], local.points, np.nan) if settled else local.points
     for keyframe in local.keyframes:
         points = apply(keyframe.T_camera_world, world[keyframe.track_ids]).astype(np.float32)
         found.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, points))

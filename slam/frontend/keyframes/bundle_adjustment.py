@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
+from slam.frontend.keyframes.depth_prior import SIGMA
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.projection import pixel_jacobian
@@ -27,9 +28,9 @@ _BLOCK = 512
 
 @dataclass(frozen=True)
 class Sightings:
-    """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, learned ``depth`` ``(S,)`` or NaN.
+    """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth`` ``(S,)``.
 
-    A point is seen at most once by a camera.
+    Depth is that in the camera by its prior, NaN for none. A point is seen at most once by a camera.
     """
 
     camera: NDArray[np.int64]
@@ -43,11 +44,14 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Noise:
-    """Sigma of a tracked corner's coordinate, pixels; residuals beyond ``huber`` sigmas weigh less."""
+    """Sigmas of a tracked corner's coordinate, pixels, and of the logarithm of depth by its prior.
+
+    Residuals beyond ``huber`` sigmas weigh less.
+    """
 
     pixel: float = 0.7
     huber: float = 1.5
-    depth: float = float(__import__("os").environ.get("DSIG", "0.3"))
+    depth: float = SIGMA
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ class BundleAdjustment:
         return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf))
 
     def residuals(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
-        """Of both pixel coordinates over their sigma ``(S, 2)``."""
+        """Of both pixel coordinates and of the logarithm of depth, over their sigmas ``(S, 3)``."""
         X = self._in_cameras(T_camera_world, points)
         z = np.maximum(X[:, 2:], _LEAST_DEPTH)
         found = np.empty((len(X), 3))
@@ -126,7 +130,7 @@ class BundleAdjustment:
         return found
 
     def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the residuals by their camera's perturbation ``(6, 2, S)`` and their point ``(3, 2, S)``."""
+        """Derivatives of the residuals by their camera's perturbation ``(6, 3, S)`` and their point ``(3, 3, S)``."""
         X = self._in_cameras(T_camera_world, points)
         by_camera = np.zeros((6, 3, len(X)))
         by_camera[:, :2] = pixel_jacobian(X, self._focal / self._noise.pixel)
@@ -152,10 +156,11 @@ class BundleAdjustment:
         return float(np.where(length < k, 0.5 * length**2, k * (length - 0.5 * k)).sum())
 
     def _lengths(self, residuals: FloatArray) -> FloatArray:
+        """Of the residual of the pixel, and of that of depth ``(S, 2)``."""
         return np.stack([np.linalg.norm(residuals[:, :2], axis=1), np.abs(residuals[:, 2])], axis=1)
 
     def weights(self, residuals: FloatArray) -> FloatArray:
-        """Square roots of Huber's weights ``(S, 1)``."""
+        """Square roots of Huber's weights ``(S, 3)``."""
         length = self._lengths(residuals)
         root = np.sqrt(np.minimum(self._noise.huber / np.maximum(length, 1e-12), 1.0))
         return np.asarray(root[:, [0, 0, 1]])

@@ -46,7 +46,7 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
     T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in local.keyframes]))
     centres, down = T_map_camera[:, :3, 3], T_map_camera[:, :3, 1].mean(axis=0)
     seen = np.unique(np.concatenate([keyframe.track_ids for keyframe in local.keyframes]))
-    points = local.points[seen[local.settled()[seen]]]
+    points = local.points[seen[local.parallax().settled[seen]]]
     if len(points) < _LEAST_POINTS:
         return None
     origin = np.median(centres, axis=0)

@@ -1,4 +1,4 @@
-"""Keyframes and the points they see: triangulation, known points found again, adjustment of the last keyframes."""
+"""Keyframes and the points they see: points from learned depth, found again, adjusted with the last keyframes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
+from slam.frontend.keyframes.depth_prior import Parallax, unit_of
 from slam.frontend.keyframes.descriptors import Descriptors
 from slam.frontend.keyframes.flow import flow
 from slam.frontend.sparse_flow import Pixels
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.geometry.triangulation import reprojection_errors, triangulate
 
 TrackIds = NDArray[np.int64]
 
@@ -32,16 +32,9 @@ _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
 # a point that two keyframes do not find is hidden
 _ATTEMPTS = 2
-_MIN_ANGLE_DEG = 0.3  # least angle between rays of a point, degrees
-# least distance over the usual depth: poses are less exact, and near points pass the angle where a camera only turns
-_MIN_BASELINE = 0.01
 # most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
 # ten times; but in a young map, depth and motion change together for long at hardly any cost
 _LIMITS, _YOUNG_LIMITS = (12, 1e-3), (60, 1e-6)
-_LOOSE = np.deg2rad(float(__import__("os").environ.get("LOOSE", "1.0")))
-_PIXEL, _DEPTH_SIGMA = 0.7, float(__import__("os").environ.get("RSIG", "0.3"))
-_LEAST_SETTLED = 20
-_G = float(__import__('os').environ.get('G', '0.9'))
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
@@ -87,7 +80,7 @@ class TrackedKeyframe:
 
 @dataclass
 class LocalMap:
-    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where not triangulated."""
+    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where unknown."""
 
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
@@ -116,72 +109,31 @@ class LocalMap:
         """Free the images of a map to which no keyframe will be added."""
         self.keyframes = [replace(keyframe, grey=None) for keyframe in self.keyframes]
 
-    def triangulate(self, intrinsics: Intrinsics) -> None:
-        """Points of the newest keyframe's tracks that have none, where the angle and the residuals allow one."""
+    def parallax(self, last: int | None = None) -> Parallax:
+        """Of all points, between the last keyframes that see them, or between all."""
+        return self._parallax_among(self.keyframes if last is None else self.keyframes[-last:])
+
+    def _parallax_among(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
+        tracks = [keyframe.track_ids[self.known(keyframe.track_ids)] for keyframe in keyframes]
+        return Parallax.of(self.points, [keyframe.T_camera_world for keyframe in keyframes], tracks)
+
+    def add_points(self, intrinsics: Intrinsics) -> None:
+        """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map."""
         newest = self.keyframes[-1]
-        track_ids = newest.track_ids[~self.known(newest.track_ids)]
-        if not len(track_ids):
-            return
-        poses, rays, point = [], [], []
-        for keyframe in self.keyframes[-_ADJUSTED - _SHARED :]:
-            _, a, b = np.intersect1d(keyframe.track_ids, track_ids, assume_unique=True, return_indices=True)
-            poses.append(np.repeat(keyframe.T_camera_world[None], len(a), axis=0))
-            rays.append(intrinsics.rays(keyframe.pixels[a]))
-            point.append(b)
-        T, ray, row = np.concatenate(poses), np.concatenate(rays), np.concatenate(point)
-        X, angle = triangulate(T, ray, row, len(track_ids))
-        error = reprojection_errors(T, X[row], ray, (intrinsics.fx, intrinsics.fy))
-        worst = np.zeros(len(track_ids))
-        np.maximum.at(worst, row, error)
-        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX) & self._has_baseline(T, row, len(track_ids))
-        self.points[track_ids[good]] = X[good]
+        tracks, learned = newest.track_ids, newest.learned_depth
+        known, is_learned = self.known(tracks), learned > 0.0
+        depth = apply(newest.T_camera_world, self.points[tracks])[:, 2]
+        both = is_learned & known & (np.nan_to_num(depth) > 0.0)
+        settled = self.parallax(_IMAGES_KEPT).settled[tracks[both]]
+        new = is_learned & ~known
+        rays = intrinsics.rays(newest.pixels[new]) * learned[new, None]
+        rays *= unit_of(depth[both] / learned[both], settled)
+        self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
 
-    def born(self, keyframe: TrackedKeyframe, intrinsics: Intrinsics) -> None:
-        """Points of a keyframe's tracks that have none, where learned depth has them."""
-        learned = np.isfinite(keyframe.learned_depth) & (keyframe.learned_depth > 0)
-        known = self.known(keyframe.track_ids)
-        both = learned & known
-        depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
-        recent = LocalMap(self.keyframes[-15:], self.points)
-        unit = unit_of(depth[both] / keyframe.learned_depth[both], recent.settled()[keyframe.track_ids][both])
-        new = learned & ~known
-        rays = intrinsics.rays(keyframe.pixels[new]) * (unit * keyframe.learned_depth[new, None])
-        self.points[keyframe.track_ids[new]] = apply(invert(keyframe.T_camera_world), rays)
-
-    def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> tuple[FloatArray, FloatArray]:
-        """The first centre from which keyframes see each point ``(N, 3)``, and the angle of their rays to it ``(N,)``."""
-        centre, cosine = np.full_like(self.points, np.nan), np.ones(len(self.points))
-        for keyframe in keyframes:
-            tracks = keyframe.track_ids[self.known(keyframe.track_ids)]
-            camera = invert(keyframe.T_camera_world)[:3, 3]
-            fresh = tracks[np.isnan(centre[tracks, 0])]
-            centre[fresh] = camera
-            first, now = self.points[tracks] - centre[tracks], self.points[tracks] - camera
-            found = (first * now).sum(axis=1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(now, axis=1))
-            cosine[tracks] = np.minimum(cosine[tracks], found)
-        return centre, np.arccos(np.clip(cosine, -1.0, 1.0))
-
-    def settled(self) -> NDArray[np.bool_]:
-        """Which points ``(N,)`` have parallax among the keyframes."""
-        return self.parallax(self.keyframes)[1] > _LOOSE
-
-    def spread(self, track_ids: TrackIds, intrinsics: Intrinsics) -> FloatArray:
-        """One sigma of points ``(M, 3)``, along the ray from which they were seen first."""
-        centre, angle = self.parallax(self.keyframes[-20:])
-        sigma = np.minimum(_PIXEL / (intrinsics.fx * np.maximum(angle[track_ids], 1e-9)), _DEPTH_SIGMA)
-        along = sigma[:, None] * (self.points[track_ids] - centre[track_ids])
-        return np.where(np.isnan(along), 0.0, along)
-
-    def _has_baseline(self, T_camera_world: FloatArray, row: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
-        """Which of ``count`` tracks are seen from places far enough apart; sightings are of tracks ``row``."""
-        newest = self.keyframes[-1]
-        known = newest.track_ids[self.known(newest.track_ids)]
-        depth = np.median(apply(newest.T_camera_world, self.points[known])[:, 2]) if len(known) else 0.0
-        centres = invert(T_camera_world)[:, :3, 3]
-        least, most = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-        np.minimum.at(least, row, centres)
-        np.maximum.at(most, row, centres)
-        return np.asarray(np.linalg.norm(most - least, axis=1) > _MIN_BASELINE * depth)
+    def spread(self, intrinsics: Intrinsics) -> FloatArray:
+        """One sigma of the points of the newest keyframe's tracks ``(M, 3)``, along the ray on which they were seen first."""
+        found = self.parallax(_IMAGES_KEPT).spread(self.points, Noise().pixel / intrinsics.fx)
+        return np.nan_to_num(found[self.keyframes[-1].track_ids])
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
         """Adjust the last keyframes and their points; older ones that see many of these points stay fixed.
@@ -236,30 +188,28 @@ class LocalMap:
 
     def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
-        cameras, track_ids, pixels, depths = [], [], [], []
-        for row, k in enumerate(chosen):
-            keyframe = self.keyframes[k]
-            known = seen[keyframe.track_ids]
-            cameras.append(np.full(int(known.sum()), row))
-            track_ids.append(keyframe.track_ids[known])
-            pixels.append(keyframe.pixels[known])
-            depths.append(keyframe.learned_depth[known])
-        depth = np.concatenate(depths)
-        camera, track, pixel = np.concatenate(cameras), np.concatenate(track_ids), np.concatenate(pixels)
+        keyframes = [self.keyframes[k] for k in chosen]
+        known = [seen[keyframe.track_ids] for keyframe in keyframes]
+        camera = np.repeat(np.arange(len(chosen)), [rows.sum() for rows in known])
+        track = np.concatenate([keyframe.track_ids[rows] for keyframe, rows in zip(keyframes, known, strict=True)])
+        pixel = np.concatenate([keyframe.pixels[rows] for keyframe, rows in zip(keyframes, known, strict=True)])
+        settled = self._parallax_among(keyframes).settled
+        depth = np.concatenate(
+            [self._prior(keyframe, settled)[rows] for keyframe, rows in zip(keyframes, known, strict=True)]
+        )
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
-        camera, pixel, depth = camera[twice], pixel[twice], depth[twice]
-        settled = self.parallax([self.keyframes[k] for k in chosen])[1][points][row_of] > _LOOSE
-        T = np.array([self.keyframes[k].T_camera_world for k in chosen])
-        X = self.points[points][row_of]
-        ratio = (np.einsum("sj,sj->s", T[camera, 2, :3], X) + T[camera, 2, 3]) / depth
-        for row in range(len(chosen)):
-            own = (camera == row) & np.isfinite(ratio) & (ratio > 0)
-            loose = own & ~settled
-            if loose.any():
-                depth[loose] *= np.median(ratio[loose]) ** (1.0 if (own & settled).sum() >= _LEAST_SETTLED else _G)
-        depth = np.where(~settled & (depth > 0), depth, np.nan)
-        return Sightings(camera, row_of, pixel, depth), points
+        return Sightings(camera[twice], row_of, pixel[twice], depth[twice]), points
+
+    def _prior(self, keyframe: TrackedKeyframe, settled: NDArray[np.bool_]) -> FloatArray:
+        """Learned depth of a keyframe's corners ``(M,)`` in the unit of its points; NaN where they have parallax."""
+        depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
+        with np.errstate(invalid="ignore"):
+            ratio = depth / keyframe.learned_depth
+            both = ratio > 0.0
+        is_settled = settled[keyframe.track_ids]
+        unit = unit_of(ratio[both], is_settled[both])
+        return np.where(both & ~is_settled, unit * keyframe.learned_depth, np.nan)
 
     def aligned(
         self,
@@ -324,13 +274,6 @@ class LocalMap:
         near = np.flatnonzero((distance < _NEAR_DEPTHS) & (cosine > _NEAR_COSINE))
         order = np.argsort((distance + 2.0 * (1.0 - cosine))[near], kind="stable")
         return [kept[k] for k in near[order]]
-
-
-def unit_of(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
-    """Of depth in a map per learned depth, by the points with parallax if there are enough."""
-    if settled.sum() >= _LEAST_SETTLED:
-        return float(np.median(ratios[settled]))
-    return float(np.median(ratios)) ** _G if len(ratios) >= _LEAST_SETTLED else 1.0
 
 
 def _matched(

@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import RelativePose
 from slam.frontend.keyframes.local_map import LocalMap, TrackIds
 from slam.frontend.sparse_flow import Pixels
 from slam.geometry.se3 import FloatArray
-
-_BETWEEN = 3  # frames that are chosen between two
-
-View = tuple[NDArray[np.intp], Pixels]
 
 
 @dataclass(frozen=True)
@@ -31,8 +25,7 @@ class TrackedFrame:
 class MapSegment:
     """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points.
 
-    ``turns`` are motions of the camera where it has no points, before the first or after the last, in the unit of
-    learned depth.
+    ``turns`` are motions of the camera where no point carries the unit, in the unit of learned depth.
     """
 
     map: LocalMap = field(default_factory=LocalMap)
@@ -49,14 +42,3 @@ class MapSegment:
         """A snapshot, which stays while this map grows."""
         return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())
 
-
-def spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:
-    """Some of these frames, evenly spread, neither the first nor the last."""
-    chosen = np.linspace(0, len(frames) - 1, _BETWEEN + 2).astype(int)[1:-1]
-    return [frames[row] for row in np.unique(chosen) if frames]
-
-
-def common(track_ids: TrackIds, frame: TrackedFrame) -> View:
-    """Rows of those corners that a frame sees, and their pixels there."""
-    _, rows, seen = np.intersect1d(track_ids, frame.track_ids, assume_unique=True, return_indices=True)
-    return rows, frame.pixels[seen]

@@ -15,23 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
-from slam.frames import DepthMap, Event, Frame, Intrinsics, RelativePose, TrackingEvent
+from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import flow, new_corners
 from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, small_image, turned
-from slam.frontend.keyframes.initialisation import add_first_keyframes, first_points
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame, common, spread
+from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
-from slam.frontend.keyframes.turns import is_turn, motion_since, rotation_and_parallax, turn_by_image
+from slam.frontend.keyframes.turns import turn_by_image
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
 from slam.geometry.se3 import FloatArray, invert, make
 
 logger = logging.getLogger(__name__)
 
-_LEAST_START_TRACKS = 60
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
@@ -41,9 +39,8 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
-_FEW = float(__import__("os").environ.get("FEW", "2"))
-_YOUNG, _YOUNG_PARALLAX_RATIO = 4, 0.0125
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
+_NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
 @dataclass
@@ -79,6 +76,8 @@ class KeyframeOdometry:
         self._intrinsics = intrinsics
         self._seed = seed
         self._state = KeyframeOdometryState() if state is None else state.copy()
+        self._spread = np.zeros((0, 3))
+        self._measure_spread()
 
     def state(self) -> KeyframeOdometryState:
         """A snapshot to resume from."""
@@ -131,46 +130,42 @@ class KeyframeOdometry:
         segment.frames.append(self._tracked(frame, track_ids, pixels))
 
     def follow(self, frame: Frame) -> None:
-        """Track and resect the next usable frame; make it a keyframe where that is wanted."""
-        before, self._state.small = self._state.small, small_image(frame.grey)
-        shift = image_shift(before, self._state.small)
-        images = before, self._state.small, self._state.T_last_step[:3, :3], shift, self._intrinsics
+        """Track and resect the next usable frame; make it a keyframe where that is wanted.
+
+        Depth of the last keyframe was learned before, if it has any.
+        """
+        state = self._state
+        before, state.small = state.small, small_image(frame.grey)
+        shift = image_shift(before, state.small)
+        images = before, state.small, state.T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
-        since, self._state.stamp = frame.stamp - self._state.stamp, frame.stamp
-        if not self._state.segments:
+        since, state.stamp = frame.stamp - state.stamp, frame.stamp
+        if not state.segments or not state.segments[-1].started:
+            state.segments = state.segments[:-1] if state.segments else []
             return self._begin(frame)
-        segment = self._state.segments[-1]
+        segment = state.segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
         self._measure_turn(segment, track_ids, pixels, since)
-        if len(track_ids) < MIN_POINTS:
-            turn = turn or image_turn(*images)
-            if turn.correlation > _SURE_CORRELATION:
-                depth = self._usual_depth()
-                self._keep_turn(turn_by_image(segment.last_tracked, frame.index, turn.R_now_before, depth))
-        if segment.started:
-            self._locate(segment, frame, track_ids, pixels, since)
-        else:
-            self._start(segment, frame, track_ids, pixels)
-        if self._state.lost or not self._state.segments[-1].started:
-            self._state.T_last_step = make(np.eye(3) if turn is None else turn.R_now_before, np.zeros(3))
+        if not self._locate(segment, frame, track_ids, pixels):
+            self._lose(segment, frame, image_turn(*images) if turn is None else turn)
+            if (state.lost + 1) * since > _MAX_LOST_S:
+                self._begin(frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
-        """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
-        keyframes = self._state.segments[-1].map.keyframes
-        for row, keyframe in list(enumerate(keyframes))[-2:]:
-            if keyframe.index == frame.index:
-                keyframes[row] = keyframe.with_depth(depth)
-                if row == len(keyframes) - 1:
-                    self._bear(self._state.segments[-1], keyframes[row])
-
-    def _bear(self, segment: MapSegment, keyframe: TrackedKeyframe) -> None:
-        if segment.map.known(keyframe.track_ids).mean() < _FEW:
-            segment.map.born(keyframe, self._intrinsics)
-        if not segment.started and segment.map.known(keyframe.track_ids).sum() >= MIN_POINTS:
+        """Learned z-depth ``(H, W)`` of the frame that was followed last, which gives points where it is a keyframe."""
+        segment = self._state.segments[-1]
+        local = segment.map
+        if local.keyframes[-1].index != frame.index:
+            return
+        local.keyframes[-1] = local.keyframes[-1].with_depth(depth)
+        local.add_points(self._intrinsics)
+        self._measure_spread()
+        points = int(local.known(local.keyframes[-1].track_ids).sum())
+        if not segment.started and points >= MIN_POINTS:
             segment.started = True
             for before in self._state.segments[:-1]:
                 before.map.forget_images()
-            self._note(keyframe.index, "map begun", support=int(segment.map.known(keyframe.track_ids).sum()))
+            self._note(frame.index, "map begun", support=points)
 
     def is_keyframe(self, index: int) -> bool:
         """Whether that frame is the last keyframe."""
@@ -189,14 +184,14 @@ class KeyframeOdometry:
             self._note(state.segments[-1].frames[-state.lost].index, "lost")
         state.segments.append(MapSegment())
         state.T_camera_world, state.lost = np.eye(4), 0
-        self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+        self._add_keyframe(state.segments[-1], frame, *_NOTHING)
 
     def _track(self, segment: MapSegment, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a turn."""
         state, keyframe = self._state, segment.map.keyframes[-1]
         rows = np.flatnonzero(~state.slipped)
         if keyframe.grey is None or not len(rows):
-            return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+            return _NOTHING
         guesses = state.places[rows]
         if turn is not None and turn.correlation > _LEAST_CORRELATION:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
@@ -211,55 +206,6 @@ class KeyframeOdometry:
         state.places[rows] = np.where(kept[:, None], found, guesses + shift)
         return keyframe.track_ids[rows[kept]], found[kept]
 
-    def _start(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
-        """The first points, once the parallax to one of the keyframes gives them; else another keyframe in time."""
-        local, last = segment.map, segment.map.keyframes[-1]
-        places, pixels = pixels, in_middle_row(pixels, self._state.turn, self._intrinsics)
-        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None))
-        for first in local.keyframes:
-            if self._started(segment, first, track_ids, pixels):
-                self._add_keyframe(segment, frame, track_ids, places)
-                segment.frames[-1] = self._tracked(frame, track_ids, pixels)
-                return
-        self._keep_turn(self._moved_since(last, frame, track_ids, pixels))
-        if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), _LEAST_START_TRACKS):
-            seen = (k for k in local.keyframes if np.isin(track_ids, k.track_ids).sum() >= _LEAST_START_TRACKS)
-            local.keyframes[:] = list(seen)
-            self._add_keyframe(segment, frame, track_ids, places)
-
-    def _started(self, segment: MapSegment, first: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> bool:
-        """Whether the parallax between a keyframe without points and the current frame gives the first ones."""
-        intrinsics, local = self._intrinsics, segment.map
-        track_ids, rows, seen = np.intersect1d(first.track_ids, track_ids, assume_unique=True, return_indices=True)
-        if len(track_ids) < _LEAST_START_TRACKS:
-            return False
-        pixels = pixels[seen]
-        rays_first, rays = intrinsics.rays(first.pixels[rows]), intrinsics.rays(pixels.astype(np.float64))
-        if is_turn(rotation_and_parallax(rays_first, rays, intrinsics)[1], intrinsics):
-            return False
-        frames = [frame for frame in segment.frames if frame.index > first.index]
-        between = [common(track_ids, each) for each in spread(frames[:-1])]
-        found = first_points(rays_first, pixels, between, intrinsics, self._seed)
-        if found is None:
-            return False
-        local.points[track_ids[found.solid]] = found.points[found.solid]
-        segment.started, segment.frames = True, frames
-        for before in self._state.segments[:-1]:
-            before.map.forget_images()
-        self._note(frames[-1].index, "map begun", support=int(found.solid.sum()))
-        self._state.T_camera_world = found.T_current_first
-        later = [keyframe for keyframe in local.keyframes if keyframe.index > first.index]
-        local.keyframes[:] = [first]
-        self._state.T_last_step = np.eye(4)
-        add_first_keyframes(segment, later, intrinsics, self._seed)
-        return True
-
-    def _moved_since(
-        self, keyframe: TrackedKeyframe, frame: Frame, track_ids: TrackIds, pixels: Pixels
-    ) -> RelativePose | None:
-        depth = self._usual_depth()
-        return motion_since(keyframe, frame.index, track_ids, pixels, depth, self._intrinsics, self._seed)
-
     def _usual_depth(self) -> float:
         """The median learned depth at the corners of the last keyframe where it is known, 1 before the first."""
         for segment in reversed(self._state.segments):
@@ -269,23 +215,23 @@ class KeyframeOdometry:
                     return float(np.median(known))
         return 1.0
 
-    def _keep_turn(self, turn: RelativePose | None) -> None:
-        """Keep a turn with the map in which the camera is lost, else with the newest."""
-        if turn is not None:
-            (self.lost_map() or self._state.segments[-1]).turns.append(turn)
+    def _lose(self, segment: MapSegment, frame: Frame, turn: ImageTurn) -> None:
+        """A frame without a pose, of which the whole image may show how the camera turned."""
+        state = self._state
+        if turn.correlation > _SURE_CORRELATION:
+            R_now_before = turn.R_now_before
+            segment.turns.append(turn_by_image(segment.last_tracked, frame.index, R_now_before, self._usual_depth()))
+        state.T_last_step = make(turn.R_now_before, np.zeros(3))
+        state.lost += 1
+        segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
 
-    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, since: float) -> None:
-        """The camera's pose from known points."""
+    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
+        """The camera's pose from known points; whether there are enough."""
         state, known = self._state, segment.map.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, state.turn, self._intrinsics)
-        pose = self._resected(segment, track_ids[known], pixels[known]) if known.any() else None
+        pose = self._resected(segment, track_ids[known], pixels[known])
         if pose is None:
-            state.lost += 1
-            segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None))
-            self._keep_turn(self._moved_since(segment.map.keyframes[-1], frame, track_ids, pixels))
-            if (state.lost + 1) * since > _MAX_LOST_S:
-                self._begin(frame)
-            return
+            return False
         state.lost = 0
         before, state.T_camera_world = state.T_camera_world, pose.T_camera_world
         state.T_last_step = state.T_camera_world @ invert(before)
@@ -296,6 +242,7 @@ class KeyframeOdometry:
         if self._wants_keyframe(segment, track_ids, pixels):
             self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(self._tracked(frame, track_ids, pixels))
+        return True
 
     def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
         """From the last pose and from the predicted one; None with too few inliers."""
@@ -303,7 +250,8 @@ class KeyframeOdometry:
             return None
         T_last = self._state.T_camera_world
         guesses = T_last, self._state.T_last_step @ T_last
-        points, spread = segment.map.points[track_ids], segment.map.spread(track_ids, self._intrinsics)
+        points = segment.map.points[track_ids]
+        spread = self._spread[np.searchsorted(segment.map.keyframes[-1].track_ids, track_ids)]
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
@@ -314,8 +262,7 @@ class KeyframeOdometry:
         before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
         R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
         rays_before, rays = self._intrinsics.rays(before), self._intrinsics.rays(pixels.astype(np.float64))
-        young = len(segment.map.keyframes) < _YOUNG
-        limit = (_YOUNG_PARALLAX_RATIO if young else _KEYFRAME_PARALLAX_RATIO) * self._intrinsics.width
+        limit = _KEYFRAME_PARALLAX_RATIO * self._intrinsics.width
         moved = float(np.median(np.linalg.norm(pixels - before, axis=1)))
         parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))
         return parallax > limit or moved > _MOST_FLOW * limit
@@ -337,11 +284,16 @@ class KeyframeOdometry:
         middle, descriptors = in_middle_row(places, state.turn, intrinsics), describe(frame.grey, places)
         local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
         if segment.started:
-            local.triangulate(intrinsics)
             local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
             state.T_camera_world = local.keyframes[-1].T_camera_world
         state.places = local.keyframes[-1].places.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
+        self._measure_spread()
+
+    def _measure_spread(self) -> None:
+        """How uncertain the points of the last keyframe are."""
+        if self._state.segments:
+            self._spread = self._state.segments[-1].map.spread(self._intrinsics)
 
     def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
         """How fast the camera turns, for a rolling shutter."""

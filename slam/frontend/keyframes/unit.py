@@ -7,13 +7,11 @@ off, and every point fits. Learned depth errs more in a single image, but alike 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import solveh_banded
 
-from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
-from slam.frontend.keyframes.joining import moved
+from slam.frames import Intrinsics, RelativePose
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.turns import turn_by_points
 from slam.geometry.se3 import FloatArray, apply, invert
 
 _LEAST_DEPTHS = 20
@@ -71,14 +69,11 @@ def pieces(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
 
 def _turn(local: LocalMap, keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray) -> RelativePose:
     """From a keyframe to a later camera in the unit of learned depth."""
-    T = keyframe.T_camera_world @ invert(T_camera_world)
-    ratios = _ratios(local, keyframe)
+    T, ratios = keyframe.T_camera_world @ invert(T_camera_world), _ratios(local, keyframe)
     if len(ratios) >= _LEAST_DEPTHS:
         T[:3, 3] *= np.median(ratios)
-    known = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
-    depth = float(np.median(known)) if len(known) else 1.0
-    length = 0.01 * depth + 0.2 * float(np.linalg.norm(T[:3, 3]))
-    return RelativePose(keyframe.index, index, T, np.repeat([np.deg2rad(0.1), length], 3), KEYFRAME_SOURCE)
+    learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
+    return turn_by_points(keyframe.index, index, T, float(np.median(learned)) if len(learned) else 1.0)
 
 
 def _carried(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:

@@ -64,8 +64,6 @@ def unit_of(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
         settled: which of these points have parallax ``(M,)``.
     """
     loose = ratios[~settled]
-    if len(loose) < _LEAST_POINTS:
-        loose = ratios
-    if len(loose) < _LEAST_POINTS:
+    if not len(loose):
         return 1.0
     return float(np.median(loose)) ** (1.0 if settled.sum() >= _LEAST_POINTS else _ANCHOR)

@@ -127,7 +127,8 @@ class LocalMap:
         settled = self.parallax(_IMAGES_KEPT).settled[tracks[both]]
         new = is_learned & ~known
         rays = intrinsics.rays(newest.pixels[new]) * learned[new, None]
-        rays *= unit_of(depth[both] / learned[both], settled)
+        r = depth[both] / learned[both]
+        rays *= float(np.median(r[settled])) if settled.sum() >= 20 else float(np.median(r)) ** 0.9 if len(r) >= 20 else 1.0
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
 
     def spread(self, intrinsics: Intrinsics) -> FloatArray:

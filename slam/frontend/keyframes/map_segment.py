@@ -33,11 +33,6 @@ class MapSegment:
     started: bool = False
     turns: list[RelativePose] = field(default_factory=list)
 
-    @property
-    def last_tracked(self) -> int:
-        """The frame that was tracked last, or the first keyframe."""
-        return max(self.map.keyframes[-1].index, *(frame.index for frame in self.frames[-1:]), 0)
-
     def copy(self) -> MapSegment:
         """A snapshot, which stays while this map grows."""
         return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())

@@ -23,7 +23,6 @@ from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shif
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
-from slam.frontend.keyframes.turns import turn_by_image
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
 from slam.geometry.se3 import FloatArray, invert, make
@@ -146,10 +145,20 @@ class KeyframeOdometry:
         segment = state.segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
         self._measure_turn(segment, track_ids, pixels, since)
-        if not self._locate(segment, frame, track_ids, pixels):
-            self._lose(segment, frame, image_turn(*images) if turn is None else turn)
-            if (state.lost + 1) * since > _MAX_LOST_S:
-                self._begin(frame)
+        if self._locate(segment, frame, track_ids, pixels):
+            return None
+        turn = image_turn(*images) if turn is None else turn
+        state.T_last_step = make(turn.R_now_before, np.zeros(3))
+        if turn.correlation > _SURE_CORRELATION and not state.lost:
+            state.T_camera_world = state.T_last_step @ state.T_camera_world
+            self._add_keyframe(segment, frame, *_NOTHING)
+            segment.frames.append(self._tracked(frame, *_NOTHING))
+            return None
+        state.lost += 1
+        segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
+        if (state.lost + 1) * since > _MAX_LOST_S:
+            self._begin(frame)
+        return None
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of the frame that was followed last, which gives points where it is a keyframe."""
@@ -206,25 +215,6 @@ class KeyframeOdometry:
         state.places[rows] = np.where(kept[:, None], found, guesses + shift)
         return keyframe.track_ids[rows[kept]], found[kept]
 
-    def _usual_depth(self) -> float:
-        """The median learned depth at the corners of the last keyframe where it is known, 1 before the first."""
-        for segment in reversed(self._state.segments):
-            for keyframe in reversed(segment.map.keyframes):
-                known = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
-                if len(known):
-                    return float(np.median(known))
-        return 1.0
-
-    def _lose(self, segment: MapSegment, frame: Frame, turn: ImageTurn) -> None:
-        """A frame without a pose, of which the whole image may show how the camera turned."""
-        state = self._state
-        if turn.correlation > _SURE_CORRELATION:
-            R_now_before = turn.R_now_before
-            segment.turns.append(turn_by_image(segment.last_tracked, frame.index, R_now_before, self._usual_depth()))
-        state.T_last_step = make(turn.R_now_before, np.zeros(3))
-        state.lost += 1
-        segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
-
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
         """The camera's pose from known points; whether there are enough."""
         state, known = self._state, segment.map.known(track_ids)
@@ -262,7 +252,8 @@ class KeyframeOdometry:
         before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
         R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
         rays_before, rays = self._intrinsics.rays(before), self._intrinsics.rays(pixels.astype(np.float64))
-        limit = _KEYFRAME_PARALLAX_RATIO * self._intrinsics.width
+        young = len(segment.map.keyframes) < 4
+        limit = (0.0125 if young else _KEYFRAME_PARALLAX_RATIO) * self._intrinsics.width
         moved = float(np.median(np.linalg.norm(pixels - before, axis=1)))
         parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))
         return parallax > limit or moved > _MOST_FLOW * limit
@@ -270,8 +261,8 @@ class KeyframeOdometry:
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then triangulation and bundle adjustment."""
         state, config, intrinsics, local = self._state, self._config, self._intrinsics, segment.map
-        T = state.T_camera_world
-        if segment.started:
+        T, is_tracked = state.T_camera_world, len(track_ids) > 0
+        if is_tracked:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
             again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
@@ -283,7 +274,7 @@ class KeyframeOdometry:
         unknown = np.full(len(track_ids), np.nan)
         middle, descriptors = in_middle_row(places, state.turn, intrinsics), describe(frame.grey, places)
         local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
-        if segment.started:
+        if is_tracked:
             local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
             state.T_camera_world = local.keyframes[-1].T_camera_world
         state.places = local.keyframes[-1].places.astype(np.float32)

@@ -6,23 +6,26 @@ off, and every point fits. Learned depth errs more in a single image, but alike 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
-from slam.frames import Intrinsics, RelativePose
+from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
+from slam.frontend.keyframes.camera_pose import MIN_POINTS
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.map_segment import MapSegment
-from slam.frontend.keyframes.turns import turn_by_points
 from slam.geometry.se3 import FloatArray, apply, invert
 
 _LEAST_DEPTHS = 20
 _PIXEL_SIGMA = 0.5  # of a sighting, pixels
 _POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
 _INDEPENDENT = 10  # points with independent errors that those of a keyframe are worth: all share its pose
-_LEARNED_SIGMA = 0.3  # of a keyframe's unit by learned depth, logarithm: its neighbours err alike
-# sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and from the first keyframe
-# to the last where learned depth is not needed
-_BEGUN, _EXACT = 0.03, 0.1
-_SETTLED, _LEAST_KEYFRAMES = float(__import__("os").environ.get("SETTLED", "10")), 4
+# sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and between two of one part
+_BEGUN, _EXACT = 0.03, 0.05
+_LEAST_KEYFRAMES = 4  # of a part
+_IMAGE_SIGMA, _IMAGE_LENGTH = np.deg2rad(0.5), 0.03  # of a turn of the whole image, radians and depths
+_ROTATION_SIGMA, _LENGTH_SIGMA = np.deg2rad(0.1), 0.01  # of a motion by points without parallax, radians and depths
+_DEPTH_SIGMA = 0.2  # of a length by learned depth, over it
 
 
 def learned_unit(local: LocalMap) -> float:
@@ -33,12 +36,9 @@ def learned_unit(local: LocalMap) -> float:
 
 def pieces(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     """The map in parts through each of which points carry one unit; what lies between them are turns."""
-    local = segment.map
-    keyframes = local.keyframes
-    variance = _carried(local, intrinsics)
-    strong = variance < float(__import__('os').environ.get('CUT', '0.05')) ** 2
-    if __import__('os').environ.get('MODE') == 'count':
-        strong = np.array([LocalMap(keyframes[max(k - 15, 0) : k], local.points).settled()[keyframes[k].track_ids].sum() >= 20 for k in range(1, len(keyframes))], np.bool_)
+    local, keyframes = segment.map, segment.map.keyframes
+    shared = np.array([np.isin(b.track_ids, a.track_ids).sum() for a, b in pairwise(keyframes)])
+    strong = (_carried(local, intrinsics) < _EXACT**2) & (shared >= MIN_POINTS)
     part = np.concatenate([[0], np.cumsum(~strong)])
     runs = [rows for number in range(part[-1] + 1) if len(rows := np.flatnonzero(part == number)) >= _LEAST_KEYFRAMES]
     if not runs:
@@ -48,32 +48,38 @@ def pieces(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
         inside[rows] = number
     starts = np.array([keyframe.index for keyframe in keyframes])
     found = [MapSegment(LocalMap([keyframes[k] for k in rows], local.points), [], True, []) for rows in runs]
-    T_before = keyframes[0].T_camera_world
-    ends = [(k, keyframes[k].index, keyframes[k].T_camera_world) for k in range(len(keyframes))]
-    moves = [(k - 1, index, T) for k, index, T in ends[1:] if inside[k] < 0 or inside[k] != inside[k - 1]]
-    known = {keyframe.index for keyframe in keyframes}
-    last = 0
+    moves = [
+        (k - 1, keyframe.index, keyframe.T_camera_world, bool(shared[k - 1] >= MIN_POINTS))
+        for k, keyframe in enumerate(keyframes)
+        if k and (inside[k] < 0 or inside[k] != inside[k - 1])
+    ]
     for frame in segment.frames:
         k = int(np.searchsorted(starts, frame.index, side="right")) - 1
-        if k >= 0 and inside[k] >= 0:
+        if inside[k] >= 0:
             found[inside[k]].frames.append(frame)
-        elif k >= 0 and frame.T_camera_world is not None and frame.index not in known:
-            moves.append((k, frame.index, frame.T_camera_world))
-    for k, index, T_camera_world in sorted(moves, key=lambda move: move[1]):
+        elif frame.T_camera_world is not None and frame.index not in starts:
+            moves.append((k, frame.index, frame.T_camera_world, True))
+    for k, index, T_camera_world, by_points in sorted(moves, key=lambda move: move[1]):
         number = max((inside[j] for j in range(k + 1) if inside[j] >= 0), default=0)
-        found[number].turns.append(_turn(local, keyframes[k], index, T_camera_world))
-    found[0].turns[:0] = [turn for turn in segment.turns if turn.to_index <= starts[0]]
-    found[-1].turns.extend(turn for turn in segment.turns if turn.to_index > starts[0])
+        found[number].turns.append(_turn(local, keyframes[k], index, T_camera_world, by_points))
     return found
 
 
-def _turn(local: LocalMap, keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray) -> RelativePose:
+def _turn(
+    local: LocalMap, keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, by_points: bool
+) -> RelativePose:
     """From a keyframe to a later camera in the unit of learned depth."""
     T, ratios = keyframe.T_camera_world @ invert(T_camera_world), _ratios(local, keyframe)
     if len(ratios) >= _LEAST_DEPTHS:
         T[:3, 3] *= np.median(ratios)
     learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
-    return turn_by_points(keyframe.index, index, T, float(np.median(learned)) if len(learned) else 1.0)
+    depth = float(np.median(learned)) if len(learned) else 1.0
+    if by_points:
+        length = _LENGTH_SIGMA * depth + _DEPTH_SIGMA * float(np.linalg.norm(T[:3, 3]))
+        sigmas = np.repeat([_ROTATION_SIGMA, length], 3)
+    else:
+        sigmas = np.repeat([_IMAGE_SIGMA, _IMAGE_LENGTH * depth], 3)
+    return RelativePose(keyframe.index, index, T, sigmas, KEYFRAME_SOURCE)
 
 
 def _carried(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:

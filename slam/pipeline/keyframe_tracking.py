@@ -16,8 +16,9 @@ from slam.frontend.keyframes.flow import new_corners
 from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
+from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.keyframes.unit import pieces, learned_unit
+from slam.frontend.keyframes.unit import learned_unit
 from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
@@ -85,7 +86,7 @@ class KeyframeTracking:
             self._relocalise(self._odometry, lost.map, frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
-        """Learned depth ``(H, W)`` of one of the last two frames."""
+        """Learned depth ``(H, W)`` of the frame that was followed last."""
         if self._odometry is not None:
             self._odometry.learn(frame, depth)
 
@@ -93,7 +94,9 @@ class KeyframeTracking:
         """Look for the camera among all keyframes of the map in which it was lost."""
         if self._places is None:
             T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
-            self._places = Relocaliser(views_of(lost, False), T_map_camera, self._intrinsics, self._seed)
+            self._places = Relocaliser(
+                views_of(lost.keyframes, lost.points), T_map_camera, self._intrinsics, self._seed
+            )
         corners = new_corners(frame.grey, np.zeros((0, 2), np.float32), self._config.max_corners)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
         found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
@@ -144,11 +147,12 @@ class KeyframeTracking:
         return before, T_before_frame
 
     def maps(self, drive: Drive) -> tuple[MapSegment, ...]:
-        """All maps so far, each in one unit; none of a vehicle, nor before the choice."""
+        """All parts of maps so far, each in one unit; none of a vehicle, nor before the choice."""
         self.choose(drive)
         if self._odometry is None or self._front_end == "both":
             return ()
-        return tuple(piece for each in self._odometry.segments if each.started for piece in pieces(each.copy(), self._intrinsics))
+        maps = [each.copy() for each in self._odometry.segments if each.started]
+        return tuple(part for each in maps for part in parts_of(each, self._intrinsics))
 
     @property
     def events(self) -> Sequence[TrackingEvent]:

@@ -15,7 +15,7 @@ from slam.config.sections import SlamConfig
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import depth_units, scaled_poses
 from slam.frontend.keyframes.joining import SharedCorners, join
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.local_map import TrackedKeyframe
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.unit import learned_unit
@@ -96,13 +96,12 @@ def close_maps(maps: Sequence[MapSegment], intrinsics: Intrinsics, config: SlamC
     return MapClosure(poses, tuple(loops), tuple(rejected), rows.learned_units(), *counts, joins)
 
 
-def views_of(local: LocalMap, settled: bool = True) -> list[View]:
-    """The keyframes of a map: corners with their points in the camera."""
+def views_of(keyframes: Sequence[TrackedKeyframe], points: FloatArray) -> list[View]:
+    """Corners of keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
     found = []
-    world = np.where(local.parallax().settled[:, None], local.points, np.nan) if settled else local.points
-    for keyframe in local.keyframes:
-        points = apply(keyframe.T_camera_world, world[keyframe.track_ids]).astype(np.float32)
-        found.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, points))
+    for keyframe in keyframes:
+        own = apply(keyframe.T_camera_world, points[keyframe.track_ids]).astype(np.float32)
+        found.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, own))
     return found
 
 
@@ -117,8 +116,12 @@ class _Rows:
         self.T_map_camera = invert(np.array([k.T_camera_world for k in self.keyframes]).reshape(-1, 4, 4))
 
     def views(self) -> list[View]:
-        """Corners with their points in the camera."""
-        return [view for segment in self.segments for view in views_of(segment.map)]
+        """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
+        found = []
+        for segment in self.segments:
+            settled = segment.map.parallax().settled[:, None]
+            found += views_of(segment.map.keyframes, np.where(settled, segment.map.points, np.nan))
+        return found
 
     def apart(self) -> NDArray[np.bool_]:
         """Which keyframes share few tracks ``(K, K)``."""

@@ -220,7 +220,7 @@ class Observer:
 
     def _process(self, pending: PendingFrame) -> None:
         frame = pending.frame
-        self._finish_tasks("depth network")
+        self._finish_tasks("depth network")  # of a keyframe, whose points depend on it
         with self._stopwatch.stage("keyframes"):
             self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
@@ -262,9 +262,6 @@ class Observer:
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:
         """Depth and camera height, predicted late where nobody asked for them before."""
-        if recent.depth is None:  # a keyframe's may be on its way
-            self._finish_tasks("depth network")
-            recent = next(r for r in self._recent if r.frame is recent.frame)
         if recent.depth is not None:
             return recent.depth, recent.height
         carried = self._carried(recent)

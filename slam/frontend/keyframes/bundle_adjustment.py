@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.depth_prior import SIGMA
+from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.projection import pixel_jacobian
@@ -51,7 +51,7 @@ class Noise:
 
     pixel: float = 0.7
     huber: float = 1.5
-    depth: float = SIGMA
+    depth: float = DEPTH_SIGMA
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,10 @@ _PIXEL_SIGMA = 0.7  # of a sighting
 
 @dataclass(frozen=True)
 class CameraPose:
-    """``T_camera_world``, ``residual_px`` ``(M,)``, infinite behind the camera, without what uncertain depth explains, and ``sigmas`` ``(6,)``.
+    """``T_camera_world``, ``residual_px`` ``(M,)`` without what uncertain depth explains, and ``sigmas`` ``(6,)``.
 
-    The sigmas are of a perturbation on the left, rotation first, for known points and independent errors.
+    Behind the camera the residual is infinite. The sigmas are of a perturbation on the left, rotation first, for
+    independent errors.
     """
 
     T_camera_world: FloatArray
@@ -56,7 +57,7 @@ def resect(
         pixels: of the points ``(M, 2)``.
         intrinsics: of the camera.
         seed: of RANSAC.
-        spread: one sigma of each point ``(M, 3)``, along the ray on which its depth is uncertain; None if all are exact.
+        spread: one sigma of each point ``(M, 3)``, in the direction in which it is uncertain; None for exact points.
     """
     spread = np.zeros_like(points) if spread is None else spread
 
@@ -83,23 +84,16 @@ def _refined(
     T = T_camera_world.copy()
     focal = np.array([intrinsics.fx, intrinsics.fy])
     rays = intrinsics.rays(pixels)[:, :2]
-    residual, X = _residual(T, points, rays, focal)
-    J = pixel_jacobian(X, focal)
-    whitened = _Whitening.of(J, T, spread)
-    residual = whitened(residual)
+    residual, J, X = _whitened(T, points, spread, rays, focal)
     for _ in range(_ITERATIONS):
         norm = np.hypot(*residual)
         scale = max(0.5 * INLIER_PX, float(np.median(norm)))
         weight = np.where(X[:, 2] > LEAST_DEPTH, 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
-        J = whitened(J)
         weighted = (weight * J).reshape(6, -1)
         information = weighted @ J.reshape(6, -1).T + 1e-9 * np.eye(6)
         step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
         T = from_rotation_vector(step[:3], step[3:]) @ T
-        residual, X = _residual(T, points, rays, focal)
-        J = pixel_jacobian(X, focal)
-        whitened = _Whitening.of(J, T, spread)
-        residual = whitened(residual)
+        residual, J, X = _whitened(T, points, spread, rays, focal)
         if np.abs(step).max() < _CONVERGED:
             break
     in_front = X[:, 2] > LEAST_DEPTH
@@ -108,29 +102,18 @@ def _refined(
     return CameraPose(T, np.where(in_front, np.hypot(*residual), np.inf), sigmas)
 
 
-@dataclass(frozen=True)
-class _Whitening:
-    """Of pixels: along ``direction`` ``(2, M)`` those of uncertain points count less, by ``less`` ``(M,)``."""
+def _whitened(
+    T_camera_world: FloatArray, points: FloatArray, spread: FloatArray, rays: FloatArray, focal: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals of pixels ``(2, M)``, their derivatives ``(6, 2, M)``, and the points in the camera ``(M, 3)``.
 
-    direction: FloatArray
-    less: FloatArray
-
-    @classmethod
-    def of(cls, J: FloatArray, T_camera_world: FloatArray, spread: FloatArray) -> _Whitening:
-        direction = np.einsum("ism,im->sm", J[3:], T_camera_world[:3, :3] @ spread.T)
-        square = np.maximum((direction**2).sum(axis=0), 1e-9)
-        return cls(direction, (1.0 - _PIXEL_SIGMA / np.sqrt(_PIXEL_SIGMA**2 + square)) / square)
-
-    def __call__(self, pixels: FloatArray) -> FloatArray:
-        """Pixels ``(..., 2, M)`` in pixels of equal certainty."""
-        along = self.less * (pixels * self.direction).sum(axis=-2)
-        return np.asarray(pixels - along[..., None, :] * self.direction)
-
-
-def _residual(
-    T_camera_world: FloatArray, points: FloatArray, rays: FloatArray, focal: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Of both pixel coordinates ``(2, M)``, and the points in the camera ``(M, 3)``."""
+    Along the line on which the sigma of a point moves its pixel, both are divided by as much as it adds to the noise.
+    """
     X = apply(T_camera_world, points)
     z = np.maximum(X[:, 2], LEAST_DEPTH)
-    return ((X[:, :2] / z[:, None] - rays) * focal).T, X
+    residual, J = ((X[:, :2] / z[:, None] - rays) * focal).T, pixel_jacobian(X, focal)
+    line = (J[3:] * (spread @ T_camera_world[:3, :3].T).T[:, None]).sum(axis=0)
+    square = np.maximum((line**2).sum(axis=0), 1e-9)
+    taken = (1.0 - _PIXEL_SIGMA / np.sqrt(_PIXEL_SIGMA**2 + square)) / square
+    residual, J = (each - (taken * (each * line).sum(axis=-2))[..., None, :] * line for each in (residual, J))
+    return residual, J, X

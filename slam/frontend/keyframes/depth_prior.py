@@ -1,69 +1,75 @@
 """Learned depth as a prior of points, until their rays have parallax.
 
-The depths of one image are right relative to each other, but share an unknown unit: only the former is used where
-points with parallax know the unit of the map (as the affine alignment of depth maps, here of a scale alone).
+Depths of one image fit each other much better than the depths of two images: they share an unknown unit. So each image
+has its own (as depth maps are aligned before they are fused), and it weighs only where no point with parallax knows the
+unit of the map.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import FloatArray, invert
 
-SIGMA = 0.3  # of the logarithm of learned depth
-_SETTLED = np.deg2rad(1.0)  # angle of rays from which on they know the depth better
+DEPTH_SIGMA = 0.3  # of the logarithm of learned depth
+_SETTLED = np.deg2rad(1.0)  # angle between rays from which on they know a depth better
 _LEAST_POINTS = 20
-_ANCHOR = 0.9  # exponent by which a unit returns to that of learned depth where no point with parallax holds it
+_RETURN = 0.9  # exponent of a unit that no point with parallax holds: it returns to that of learned depth
 
 
-@dataclass(frozen=True)
 class Parallax:
-    """The first ``centre`` that saw each point ``(N, 3)``, NaN for none, and the widest ``angle`` of its ray to others.
+    """Of ``N`` points: the first ``centre`` that saw each ``(N, 3)``, NaN for none, and ``angle`` ``(N,)``.
 
-    Angles ``(N,)`` are in radians.
+    The angle is the widest between that first ray of a point and others, radians.
     """
 
-    centre: FloatArray
-    angle: FloatArray
+    def __init__(self, points: FloatArray) -> None:
+        """Before any camera sees the points ``(N, 3)``, which are in the world."""
+        self._points = points
+        self._cosine = np.ones(len(points))
+        self.centre = np.full_like(points, np.nan)
 
-    @classmethod
-    def of(
-        cls, points: FloatArray, T_camera_world: Sequence[FloatArray], track_ids: Sequence[NDArray[np.int64]]
-    ) -> Parallax:
-        """Of points ``(N, 3)`` in the world, by cameras in time order and the rows of the points that each sees."""
-        centre, cosine = np.full_like(points, np.nan), np.ones(len(points))
-        for T, tracks in zip(T_camera_world, track_ids, strict=True):
-            camera = invert(T)[:3, 3]
-            fresh = tracks[np.isnan(centre[tracks, 0])]
-            centre[fresh] = camera
-            first, now = points[tracks] - centre[tracks], points[tracks] - camera
-            lengths = np.sqrt((first**2).sum(axis=1) * (now**2).sum(axis=1))
-            cosine[tracks] = np.fmin(cosine[tracks], (first * now).sum(axis=1) / np.maximum(lengths, 1e-12))
-        return cls(centre, np.arccos(np.clip(cosine, -1.0, 1.0)))
+    def see(self, T_camera_world: FloatArray, rows: NDArray[np.int64]) -> None:
+        """The next camera in time order sees the points of these rows."""
+        camera, points = invert(T_camera_world)[:3, 3], self._points[rows]
+        fresh = rows[np.isnan(self.centre[rows, 0])]
+        self.centre[fresh] = camera
+        first, now = points - self.centre[rows], points - camera
+        lengths = np.sqrt((first**2).sum(axis=1) * (now**2).sum(axis=1))
+        cosine = (first * now).sum(axis=1) / np.maximum(lengths, 1e-12)
+        self._cosine[rows] = np.minimum(self._cosine[rows], cosine)
+
+    @property
+    def angle(self) -> FloatArray:
+        """Radians ``(N,)``."""
+        return np.asarray(np.arccos(np.clip(self._cosine, -1.0, 1.0)))
 
     @property
     def settled(self) -> NDArray[np.bool_]:
         """Which points have parallax ``(N,)``."""
-        return np.asarray(self.angle > _SETTLED)
+        return np.asarray(self._cosine < np.cos(_SETTLED))
 
-    def spread(self, points: FloatArray, pixel_angle: float) -> FloatArray:
-        """One sigma of each point along its first ray ``(N, 3)``, where an angle is known to ``pixel_angle`` radians."""
-        sigma = np.minimum(pixel_angle / np.maximum(self.angle, 1e-9), SIGMA)
-        return np.asarray(sigma[:, None] * (points - self.centre))
+    def spread(self, pixel_angle: float) -> FloatArray:
+        """One sigma of each point along its first ray ``(N, 3)``, if rays are known to ``pixel_angle`` radians."""
+        sigma = np.minimum(pixel_angle / np.maximum(self.angle, 1e-9), DEPTH_SIGMA)
+        return np.asarray(sigma[:, None] * (self._points - self.centre))
 
 
-def unit_of(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
-    """The unit of the map per learned depth of one image, for its points without parallax.
+def unit_for_new(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
+    """The unit of a map per learned depth of an image, for new points of this image.
 
     Args:
-        ratios: depth in the map over learned depth ``(M,)``, positive.
+        ratios: of the depth of known points in the map over their learned depth ``(M,)``, positive.
         settled: which of these points have parallax ``(M,)``.
     """
+    if settled.sum() >= _LEAST_POINTS:
+        return float(np.median(ratios[settled]))
+    return float(np.median(ratios)) ** _RETURN if len(ratios) >= _LEAST_POINTS else 1.0
+
+
+def unit_for_loose(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
+    """The same for its points without parallax: their own unit, so that they do not pull at the others."""
     loose = ratios[~settled]
-    if not len(loose):
-        return 1.0
-    return float(np.median(loose)) ** (1.0 if settled.sum() >= _LEAST_POINTS else _ANCHOR)
+    held = settled.sum() >= _LEAST_POINTS
+    return float(np.median(loose)) ** (1.0 if held else _RETURN) if len(loose) else 1.0

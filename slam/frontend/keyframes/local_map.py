@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
-from slam.frontend.keyframes.depth_prior import Parallax, unit_of
+from slam.frontend.keyframes.depth_prior import Parallax, unit_for_loose, unit_for_new
 from slam.frontend.keyframes.descriptors import Descriptors
 from slam.frontend.keyframes.flow import flow
 from slam.frontend.sparse_flow import Pixels
@@ -111,30 +112,28 @@ class LocalMap:
 
     def parallax(self, last: int | None = None) -> Parallax:
         """Of all points, between the last keyframes that see them, or between all."""
-        return self._parallax_among(self.keyframes if last is None else self.keyframes[-last:])
+        return self._parallax(self.keyframes if last is None else self.keyframes[-last:])
 
-    def _parallax_among(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
-        tracks = [keyframe.track_ids[self.known(keyframe.track_ids)] for keyframe in keyframes]
-        return Parallax.of(self.points, [keyframe.T_camera_world for keyframe in keyframes], tracks)
+    def _parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
+        found = Parallax(self.points)
+        for keyframe in keyframes:
+            found.see(keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)])
+        return found
 
     def add_points(self, intrinsics: Intrinsics) -> None:
         """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map."""
         newest = self.keyframes[-1]
         tracks, learned = newest.track_ids, newest.learned_depth
-        known, is_learned = self.known(tracks), learned > 0.0
-        depth = apply(newest.T_camera_world, self.points[tracks])[:, 2]
-        both = is_learned & known & (np.nan_to_num(depth) > 0.0)
-        settled = self.parallax(_IMAGES_KEPT).settled[tracks[both]]
-        new = is_learned & ~known
-        rays = intrinsics.rays(newest.pixels[new]) * learned[new, None]
-        r = depth[both] / learned[both]
-        rays *= float(np.median(r[settled])) if settled.sum() >= 20 else float(np.median(r)) ** 0.9 if len(r) >= 20 else 1.0
+        ratios = self._ratios(newest)
+        both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
+        unit = unit_for_new(ratios[both], self.parallax(_IMAGES_KEPT).settled[tracks[both]])
+        rays = intrinsics.rays(newest.pixels[new]) * (unit * learned[new, None])
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
 
     def spread(self, intrinsics: Intrinsics) -> FloatArray:
-        """One sigma of the points of the newest keyframe's tracks ``(M, 3)``, along the ray on which they were seen first."""
-        found = self.parallax(_IMAGES_KEPT).spread(self.points, Noise().pixel / intrinsics.fx)
-        return np.nan_to_num(found[self.keyframes[-1].track_ids])
+        """One sigma of the newest keyframe's points ``(M, 3)``, along the ray on which each was seen first."""
+        spread = self.parallax(_IMAGES_KEPT).spread(Noise().pixel / intrinsics.fx)
+        return np.nan_to_num(spread[self.keyframes[-1].track_ids])
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
         """Adjust the last keyframes and their points; older ones that see many of these points stay fixed.
@@ -190,27 +189,32 @@ class LocalMap:
     def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
         keyframes = [self.keyframes[k] for k in chosen]
+        settled = self._parallax(keyframes).settled
         known = [seen[keyframe.track_ids] for keyframe in keyframes]
         camera = np.repeat(np.arange(len(chosen)), [rows.sum() for rows in known])
-        track = np.concatenate([keyframe.track_ids[rows] for keyframe, rows in zip(keyframes, known, strict=True)])
-        pixel = np.concatenate([keyframe.pixels[rows] for keyframe, rows in zip(keyframes, known, strict=True)])
-        settled = self._parallax_among(keyframes).settled
-        depth = np.concatenate(
-            [self._prior(keyframe, settled)[rows] for keyframe, rows in zip(keyframes, known, strict=True)]
-        )
+
+        def joined(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate([part[rows] for part, rows in zip(parts, known, strict=True)])
+
+        track = joined(keyframe.track_ids for keyframe in keyframes)
+        pixel = joined(keyframe.pixels for keyframe in keyframes)
+        depth = joined(self._prior(keyframe, settled) for keyframe in keyframes)
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
         return Sightings(camera[twice], row_of, pixel[twice], depth[twice]), points
 
     def _prior(self, keyframe: TrackedKeyframe, settled: NDArray[np.bool_]) -> FloatArray:
-        """Learned depth of a keyframe's corners ``(M,)`` in the unit of its points; NaN where they have parallax."""
-        depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
-        with np.errstate(invalid="ignore"):
-            ratio = depth / keyframe.learned_depth
-            both = ratio > 0.0
-        is_settled = settled[keyframe.track_ids]
-        unit = unit_of(ratio[both], is_settled[both])
+        """Learned depth of a keyframe's corners ``(M,)`` in the unit of the map; NaN where they have parallax."""
+        ratios, is_settled = self._ratios(keyframe), settled[keyframe.track_ids]
+        both = ratios > 0.0
+        unit = unit_for_loose(ratios[both], is_settled[both])
         return np.where(both & ~is_settled, unit * keyframe.learned_depth, np.nan)
+
+    def _ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
+        """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""
+        depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
+        learned = np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan)
+        return np.asarray(depth / learned)
 
     def aligned(
         self,

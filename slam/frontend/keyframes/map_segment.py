@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-
 from slam.frames import RelativePose
 from slam.frontend.keyframes.local_map import LocalMap, TrackIds
 from slam.frontend.sparse_flow import Pixels
@@ -36,4 +35,3 @@ class MapSegment:
     def copy(self) -> MapSegment:
         """A snapshot, which stays while this map grows."""
         return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())
-

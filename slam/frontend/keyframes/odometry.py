@@ -131,7 +131,8 @@ class KeyframeOdometry:
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted.
 
-        Depth of the last keyframe was learned before, if it has any.
+        Where too few corners are tracked, the turn of the whole image leads to a keyframe of new corners. Depth of the
+        last keyframe has been learned, if it has any.
         """
         state = self._state
         before, state.small = state.small, small_image(frame.grey)
@@ -139,26 +140,26 @@ class KeyframeOdometry:
         images = before, state.small, state.T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
         since, state.stamp = frame.stamp - state.stamp, frame.stamp
-        if not state.segments or not state.segments[-1].started:
-            state.segments = state.segments[:-1] if state.segments else []
-            return self._begin(frame)
+        if not state.segments or not state.segments[-1].started:  # without learned depth there are no points
+            del state.segments[-1:]
+            self._begin(frame)
+            return
         segment = state.segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
         self._measure_turn(segment, track_ids, pixels, since)
         if self._locate(segment, frame, track_ids, pixels):
-            return None
+            return
         turn = image_turn(*images) if turn is None else turn
         state.T_last_step = make(turn.R_now_before, np.zeros(3))
         if turn.correlation > _SURE_CORRELATION and not state.lost:
             state.T_camera_world = state.T_last_step @ state.T_camera_world
             self._add_keyframe(segment, frame, *_NOTHING)
             segment.frames.append(self._tracked(frame, *_NOTHING))
-            return None
+            return
         state.lost += 1
         segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
         if (state.lost + 1) * since > _MAX_LOST_S:
             self._begin(frame)
-        return None
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of the frame that was followed last, which gives points where it is a keyframe."""
@@ -189,7 +190,7 @@ class KeyframeOdometry:
     def _begin(self, frame: Frame) -> None:
         """A new map whose first keyframe is this frame."""
         state = self._state
-        if state.segments:
+        if state.lost:
             self._note(state.segments[-1].frames[-state.lost].index, "lost")
         state.segments.append(MapSegment())
         state.T_camera_world, state.lost = np.eye(4), 0
@@ -259,7 +260,7 @@ class KeyframeOdometry:
         return parallax > limit or moved > _MOST_FLOW * limit
 
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
-        """Old corners aligned and found again, new ones between them, then triangulation and bundle adjustment."""
+        """Old corners aligned and found again, new ones between them, then bundle adjustment."""
         state, config, intrinsics, local = self._state, self._config, self._intrinsics, segment.map
         T, is_tracked = state.T_camera_world, len(track_ids) > 0
         if is_tracked:

@@ -10,6 +10,8 @@ from slam.frames import Grey, Mask, resized_mask
 
 Pixels = NDArray[np.float32]
 _LIMITS = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
+# least eigenvalue of a window's gradients: a tenth of what OpenCV wants, for plain walls
+_LEAST_TEXTURE = 1e-5
 
 
 def lucas_kanade(
@@ -41,6 +43,7 @@ def lucas_kanade(
         maxLevel=levels,
         criteria=(_LIMITS, *limits),
         flags=0 if guesses is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=_LEAST_TEXTURE,
     )
     return moved.reshape(-1, 2), status.ravel().astype(bool)
 

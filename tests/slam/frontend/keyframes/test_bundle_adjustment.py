@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,10 @@ from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert
 INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
 
 
-def scene(cameras: int = 6, points: int = 60, noise_px: float = 0.0) -> tuple[FloatArray, FloatArray, Sightings]:
-    """Cameras on a walk, points before them, and two thirds of all sightings."""
+def scene(
+    cameras: int = 6, points: int = 60, noise_px: float = 0.0, depth_sigma: float = 0.0
+) -> tuple[FloatArray, FloatArray, Sightings]:
+    """Cameras on a walk, points before them, two thirds of all sightings, and depth by a prior of a third of these."""
     rng = np.random.default_rng(1)
     centres = np.cumsum(rng.normal(0.0, 0.15, (cameras, 3)), axis=0)
     T_camera_world = invert(from_rotation_vector(rng.normal(0.0, 0.1, (cameras, 3)), centres))
@@ -20,7 +24,8 @@ def scene(cameras: int = 6, points: int = 60, noise_px: float = 0.0) -> tuple[Fl
     places = np.concatenate([apply(T_camera_world[c], X[[p]]) for c, p in zip(camera, point, strict=True)])
     pixels = places @ INTRINSICS.K.T
     noise = rng.normal(0.0, noise_px, (len(camera), 2))
-    return T_camera_world, X, Sightings(camera, point, pixels[:, :2] / pixels[:, 2:] + noise)
+    depth = np.where(rng.random(len(camera)) < 0.3, places[:, 2] * np.exp(rng.normal(0.0, depth_sigma)), np.nan)
+    return T_camera_world, X, Sightings(camera, point, pixels[:, :2] / pixels[:, 2:] + noise, depth)
 
 
 def disturbed(T_camera_world: FloatArray, X: FloatArray, fixed: int) -> tuple[FloatArray, FloatArray]:
@@ -32,7 +37,7 @@ def disturbed(T_camera_world: FloatArray, X: FloatArray, fixed: int) -> tuple[Fl
 
 
 def test_jacobians_are_the_derivatives_of_the_residuals() -> None:
-    T, X, sightings = scene()
+    T, X, sightings = scene(depth_sigma=0.3)
     problem = BundleAdjustment(sightings, INTRINSICS, np.ones(len(T), np.bool_), Noise(0.5))
     by_camera, by_point = problem.jacobians(T, X)
     for axis in range(6):
@@ -80,7 +85,7 @@ def test_a_wrong_sighting_moves_little() -> None:
     free = np.arange(len(T)) >= 2
     pixels = sightings.pixels.copy()
     pixels[::20] += 30.0
-    wrong = Sightings(sightings.camera, sightings.point, pixels)
+    wrong = replace(sightings, pixels=pixels)
 
     def error(noise: Noise) -> float:
         solved = BundleAdjustment(wrong, INTRINSICS, free, noise).solve(T, X, 30, 1e-9)
@@ -95,3 +100,18 @@ def test_points_eliminated_in_blocks_give_the_same(points: int) -> None:
     problem = BundleAdjustment(sightings, INTRINSICS, np.arange(len(T)) >= 2, Noise())
     solved = problem.solve(*disturbed(T, X, 2), iterations=30, tolerance=1e-12)
     np.testing.assert_allclose(solved.T_camera_world, T, atol=1e-6)
+
+
+def test_a_turn_has_depth_by_its_prior() -> None:
+    """Where rays have no parallax, points go to their prior depth along them and cameras turn."""
+    _, X, sightings = scene()
+    turns = np.column_stack([np.zeros(6), np.linspace(0.0, 0.1, 6), np.zeros(6)])
+    T = invert(from_rotation_vector(turns, np.zeros((6, 3))))
+    places = np.einsum("sij,sj->si", T[sightings.camera, :3, :3], X[sightings.point])
+    pixels = places @ INTRINSICS.K.T
+    turned = replace(sightings, pixels=pixels[:, :2] / pixels[:, 2:], depth=places[:, 2])
+    problem = BundleAdjustment(turned, INTRINSICS, np.arange(6) > 0, Noise())
+    start = X * np.random.default_rng(3).uniform(0.8, 1.25, (len(X), 1))
+    solved = problem.solve(T, start, iterations=60, tolerance=1e-12)
+    np.testing.assert_allclose(solved.points, X, rtol=1e-3)
+    np.testing.assert_allclose(solved.T_camera_world, T, atol=1e-4)

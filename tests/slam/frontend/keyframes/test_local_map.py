@@ -5,32 +5,72 @@ import pytest
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.geometry.se3 import apply, invert
+from slam.geometry.se3 import FloatArray, apply, invert, make
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
 TRACKS, KNOWN = 60, 30
 
 
-def seen(index: int, T_camera_world: np.ndarray, points: np.ndarray, noise_px: np.ndarray) -> TrackedKeyframe:
-    x, y, z = apply(T_camera_world, points).T
-    pixels = np.column_stack([500 * x / z + 319.5, 500 * y / z + 239.5]) + noise_px
-    nothing = np.zeros((TRACKS, 32), np.uint8)
-    depth = np.full(TRACKS, np.nan)
-    return TrackedKeyframe(index, T_camera_world, np.arange(TRACKS), pixels, pixels, depth, nothing, None)
-
-
-@pytest.mark.parametrize(("baseline_m", "least", "most"), [(0.02, 0, 0), (0.4, 25, 30)])
-def test_points_need_cameras_apart(baseline_m: float, least: int, most: int) -> None:
-    """Where a camera only turns, noise of the corners makes angles wide enough for points, all of them too near."""
+def scene() -> FloatArray:
     rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-2, 2, (TRACKS, 2)), rng.uniform(4, 6, TRACKS)])
-    T_world_second = np.eye(4)
-    T_world_second[0, 3] = baseline_m
+    return np.column_stack([rng.uniform(-2, 2, (TRACKS, 2)), rng.uniform(4, 6, TRACKS)])
+
+
+def seen(index: int, T_world_camera: FloatArray, points: FloatArray, learned_unit: float) -> TrackedKeyframe:
+    T, nothing = invert(T_world_camera), np.zeros((TRACKS, 32), np.uint8)
+    x, y, z = apply(T, points).T
+    pixels = np.column_stack([500 * x / z + 319.5, 500 * y / z + 239.5])
+    return TrackedKeyframe(index, T, np.arange(TRACKS), pixels, pixels, learned_unit * z, nothing, None)
+
+
+def along(x: float) -> FloatArray:
+    return make(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("baseline", "unit"), [(0.5, 1.0), (0.01, 2.0**0.9 / 2.0)])
+def test_new_points_have_the_unit_of_those_with_parallax(baseline: float, unit: float) -> None:
+    """Learned depth is half the depth: without parallax the unit returns to that of learned depth by a tenth."""
+    points = scene()
     local = LocalMap(points=points.copy())
     local.points[KNOWN:] = np.nan
-    for index, T_world_camera in enumerate((np.eye(4), T_world_second)):
-        local.add(seen(index, invert(T_world_camera), points, rng.normal(0, 2, (TRACKS, 2))))
-    local.triangulate(CAMERA)
-    found = np.isfinite(local.points[KNOWN:, 0])
-    assert least <= found.sum() <= most
-    np.testing.assert_allclose(local.points[KNOWN:][found, 2], points[KNOWN:][found, 2], rtol=0.3)
+    for k in range(3):
+        local.add(seen(k, along(k * baseline), points, 0.5))
+    local.add_points(CAMERA)
+    in_camera = apply(local.keyframes[-1].T_camera_world, points[KNOWN:]) * unit
+    np.testing.assert_allclose(apply(local.keyframes[-1].T_camera_world, local.points[KNOWN:]), in_camera, rtol=1e-9)
+    np.testing.assert_array_equal(local.points[:KNOWN], points[:KNOWN])
+
+
+def test_the_first_points_are_at_learned_depth_where_it_is_known() -> None:
+    points = scene()
+    local = LocalMap(points=np.full((TRACKS, 3), np.nan))
+    local.add(seen(0, np.eye(4), points, 1.5))
+    local.keyframes[0].learned_depth[:10] = np.nan
+    local.keyframes[0].learned_depth[10] = 0.0
+    local.add_points(CAMERA)
+    np.testing.assert_allclose(local.points[11:], 1.5 * points[11:])
+    assert np.isnan(local.points[:11]).all()
+
+
+def test_points_without_parallax_are_uncertain_along_their_first_ray() -> None:
+    points = scene()
+    local = LocalMap(points=points.copy())
+    local.add(seen(0, np.eye(4), points, 1.0))
+    np.testing.assert_allclose(local.spread(CAMERA), 0.3 * points)
+    local.add(seen(1, along(1.0), points, 1.0))
+    spread = local.spread(CAMERA)
+    # 0.7 pixels over an angle of some ten degrees
+    assert np.linalg.norm(np.cross(spread, points), axis=1).max() < 1e-9
+    assert (np.linalg.norm(spread, axis=1) < 0.02 * np.linalg.norm(points, axis=1)).all()
+
+
+def test_adjustment_takes_the_unit_of_loose_points_from_themselves() -> None:
+    """Points that have parallax stay where they are, although learned depth of the others has another unit."""
+    points = scene()
+    points[KNOWN:] *= 40.0
+    local = LocalMap(points=points.copy())
+    for k in range(4):
+        local.add(seen(k, along(0.2 * k), points, np.where(np.arange(TRACKS) < KNOWN, 1.0, 3.0)))
+    local.adjust(CAMERA)
+    np.testing.assert_allclose(local.points, points, rtol=1e-3)
+    np.testing.assert_allclose(local.keyframes[-1].T_camera_world, invert(along(0.6)), atol=1e-4)

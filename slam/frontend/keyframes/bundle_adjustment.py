@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA
+from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA, HUBER
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.projection import pixel_jacobian
@@ -50,13 +50,13 @@ class Noise:
     """
 
     pixel: float = 0.7
-    huber: float = 1.5
+    huber: float = HUBER
     depth: float = DEPTH_SIGMA
 
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Cameras ``T_camera_world`` ``(K, 4, 4)``, ``points`` ``(P, 3)`` in the world, ``residual_px`` ``(S,)``.
+    """Cameras ``T_camera_world`` ``(K, 4, 4)``, ``points`` ``(P, 3)`` in the world, ``residual_px`` ``(S,)``, the cost.
 
     Behind a camera the residual is infinite.
     """
@@ -64,6 +64,7 @@ class Adjusted:
     T_camera_world: FloatArray
     points: FloatArray
     residual_px: FloatArray
+    cost: float
 
 
 class BundleAdjustment:
@@ -118,7 +119,7 @@ class BundleAdjustment:
             if damping > _MOST_DAMPING:
                 break
         pixel = np.linalg.norm(residuals[:, :2], axis=1) * self._noise.pixel
-        return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf))
+        return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf), cost)
 
     def residuals(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
         """Of both pixel coordinates and of the logarithm of depth, over their sigmas ``(S, 3)``."""

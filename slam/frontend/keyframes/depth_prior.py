@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from slam.geometry.se3 import FloatArray, invert
 
 DEPTH_SIGMA = 0.3  # of the logarithm of learned depth
+HUBER = 1.5  # sigmas beyond which residuals of an adjustment weigh less
+_ROUNDS = 10
 _SETTLED = np.deg2rad(1.0)  # angle between rays from which on they know a depth better
 _LEAST_POINTS = 20
 _RETURN = 0.9  # exponent of a unit that no point with parallax holds: it returns to that of learned depth
@@ -69,7 +71,15 @@ def unit_for_new(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
 
 
 def unit_for_loose(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
-    """The same for its points without parallax: their own unit, so that they do not pull at the others."""
-    loose = ratios[~settled]
-    held = settled.sum() >= _LEAST_POINTS
-    return float(np.median(loose)) ** (1.0 if held else _RETURN) if len(loose) else 1.0
+    """The same for its points without parallax: their own unit, so that together they do not pull at the map.
+
+    It is Huber's location of the logarithms, where the pulls of the adjustment cancel.
+    """
+    logarithms = np.log(ratios[~settled])
+    if not len(logarithms):
+        return 1.0
+    unit = float(np.median(logarithms))
+    for _ in range(_ROUNDS):
+        weight = np.minimum(1.0, HUBER * DEPTH_SIGMA / np.maximum(np.abs(logarithms - unit), 1e-9))
+        unit = float((weight * logarithms).sum() / weight.sum())
+    return float(np.exp(unit if settled.sum() >= _LEAST_POINTS else _RETURN * unit))

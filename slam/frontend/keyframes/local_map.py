@@ -149,7 +149,7 @@ class LocalMap:
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
-        gone, dead = self.solve(chosen, max(len(fixed), 1), sightings, track_ids, intrinsics, limits)
+        gone, dead = self.solve(chosen, max(len(fixed), 1 + (first > 0)), sightings, track_ids, intrinsics, limits)
         return np.concatenate([dead, gone[-1]])
 
     def solve(

@@ -18,6 +18,7 @@ from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
+from slam.frontend.keyframes.first_motion import first_motion
 from slam.frontend.keyframes.flow import flow, new_corners
 from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, small_image, turned
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
@@ -25,7 +26,7 @@ from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
-from slam.geometry.se3 import FloatArray, invert, make
+from slam.geometry.se3 import FloatArray, apply, invert, make
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +40,7 @@ _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked tha
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
+_YOUNG_KEYFRAMES = 4
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -231,6 +233,7 @@ class KeyframeOdometry:
         kept = ~np.isin(track_ids, slipped)
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
         if self._wants_keyframe(segment, track_ids, pixels):
+            self._check_first_motion(segment, track_ids, pixels)
             self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(self._tracked(frame, track_ids, pixels))
         return True
@@ -246,6 +249,21 @@ class KeyframeOdometry:
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
+    def _check_first_motion(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> None:
+        """The best motion since the last keyframe, and its points, where these had no parallax before."""
+        local, before, state = segment.map, segment.map.keyframes[-1], self._state
+        rows = np.searchsorted(before.track_ids, track_ids)
+        known = local.known(track_ids)
+        if local.parallax(_YOUNG_KEYFRAMES).settled[track_ids].sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
+            return
+        tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
+        depth = apply(before.T_camera_world, local.points[tracks])[:, 2]
+        T = state.T_camera_world @ invert(before.T_camera_world)
+        T_now_before, depth = first_motion(T, pixels_before, now, depth, self._intrinsics, self._seed)
+        state.T_camera_world = T_now_before @ before.T_camera_world
+        points = self._intrinsics.rays(pixels_before) * depth[:, None]
+        local.points[tracks] = apply(invert(before.T_camera_world), points)
+
     def _wants_keyframe(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> bool:
         keyframe = segment.map.keyframes[-1]
         if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(keyframe.track_ids), MIN_POINTS):
@@ -253,7 +271,7 @@ class KeyframeOdometry:
         before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
         R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
         rays_before, rays = self._intrinsics.rays(before), self._intrinsics.rays(pixels.astype(np.float64))
-        young = len(segment.map.keyframes) < 4
+        young = len(segment.map.keyframes) < _YOUNG_KEYFRAMES
         limit = (0.0125 if young else _KEYFRAME_PARALLAX_RATIO) * self._intrinsics.width
         moved = float(np.median(np.linalg.norm(pixels - before, axis=1)))
         parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))

@@ -1,0 +1,64 @@
+"""The first motion with parallax, where points have nothing but learned depth: the best of several starts.
+
+A scene without relief fits a motion and its reverse alike, with near and far exchanged. From learned depth alone the
+adjustment may end in the wrong one, and from there no later keyframe leads back. So it also starts from motions by
+essential matrix and homographies (Faugeras and Lustman 1988), and what fits best is taken.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import Intrinsics
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
+from slam.frontend.visual.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
+from slam.geometry.se3 import FloatArray, invert, make
+
+_INLIER_PX = 1.0
+_LIMITS = 30, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
+_BETTER = 0.8  # of the cost of the first start, for another one to be taken
+
+
+def first_motion(
+    T_now_before: FloatArray,
+    pixels_before: FloatArray,
+    pixels: FloatArray,
+    depth: FloatArray,
+    intrinsics: Intrinsics,
+    seed: int = 0,
+) -> tuple[FloatArray, FloatArray]:
+    """``T_now_before`` of two views, and the depth in the first one ``(M,)``, in the unit of a prior.
+
+    Args:
+        T_now_before: the first start.
+        pixels_before: of corners ``(M, 2)`` in the first view.
+        pixels: in the second.
+        depth: of the corners in the first view by the prior ``(M,)``.
+        intrinsics: of both.
+        seed: of RANSAC.
+    """
+    rays_before, rays = intrinsics.rays(pixels_before), intrinsics.rays(pixels)
+    tolerance = _INLIER_PX / intrinsics.fx
+    by_essential = unit_pose_by_essential(rays_before, rays, tolerance, seed)
+    motions = [] if by_essential is None else [by_essential]
+    starts = [(T_now_before, depth)]
+    for motion in motions + unit_poses_by_homography(rays_before, rays, tolerance, seed):
+        triangulated = triangulated_depth(rays_before, rays, motion)
+        ahead = triangulated > 0.0
+        if ahead.any():
+            unit = float(np.median(depth[ahead] / triangulated[ahead]))
+            at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
+            starts.append((make(motion.R_current_previous, unit * motion.direction), at))
+    rows = np.arange(len(pixels))
+    sightings = Sightings(
+        np.repeat([0, 1], len(rows)),
+        np.tile(rows, 2),
+        np.concatenate([pixels_before, pixels]),
+        np.concatenate([depth, np.full(len(rows), np.nan)]),
+    )
+    problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]), Noise())
+    solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_LIMITS) for T, z in starts]
+    costs = np.array([each.cost for each in solved])
+    best = solved[int(np.argmin(costs))] if costs.min() < _BETTER * costs[0] else solved[0]
+    return best.T_camera_world[1], best.points[:, 2]

@@ -8,12 +8,12 @@ essential matrix and homographies (Faugeras and Lustman 1988), and what fits bes
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.visual.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
-from slam.geometry.se3 import FloatArray, invert, make
+from slam.geometry.se3 import FloatArray, make
 
 _INLIER_PX = 1.0
 _LIMITS = 30, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
@@ -49,7 +49,8 @@ def first_motion(
         if ahead.any():
             unit = float(np.median(depth[ahead] / triangulated[ahead]))
             at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
-            starts.append((make(motion.R_current_previous, unit * motion.direction), at))
+            R = Rotation.from_matrix(motion.R_current_previous).as_matrix()  # OpenCV's are less exact
+            starts.append((make(R, unit * motion.direction), at))
     rows = np.arange(len(pixels))
     sightings = Sightings(
         np.repeat([0, 1], len(rows)),

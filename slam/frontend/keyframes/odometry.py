@@ -39,7 +39,8 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
-_KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
+# median parallax that asks for a keyframe, over the image width; in a map of few keyframes
+_PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
 _YOUNG_KEYFRAMES = 4
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
@@ -232,8 +233,10 @@ class KeyframeOdometry:
         state.slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
-        if self._wants_keyframe(segment, track_ids, pixels):
-            self._check_first_motion(segment, track_ids, pixels)
+        parallax_ratio = self._parallax_ratio(segment, track_ids, pixels)
+        if self._wants_keyframe(segment, track_ids, pixels, parallax_ratio):
+            if parallax_ratio > _YOUNG_PARALLAX_RATIO:
+                self._check_first_motion(segment, track_ids, pixels)
             self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(self._tracked(frame, track_ids, pixels))
         return True
@@ -264,18 +267,24 @@ class KeyframeOdometry:
         points = self._intrinsics.rays(pixels_before) * depth[:, None]
         local.points[tracks] = apply(invert(before.T_camera_world), points)
 
-    def _wants_keyframe(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> bool:
-        keyframe = segment.map.keyframes[-1]
-        if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(keyframe.track_ids), MIN_POINTS):
+    def _wants_keyframe(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, parallax_ratio: float) -> bool:
+        local, last = segment.map, segment.map.keyframes[-1]
+        if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS):
             return True
-        before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
-        R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
-        rays_before, rays = self._intrinsics.rays(before), self._intrinsics.rays(pixels.astype(np.float64))
-        young = len(segment.map.keyframes) < _YOUNG_KEYFRAMES
-        limit = (0.0125 if young else _KEYFRAME_PARALLAX_RATIO) * self._intrinsics.width
-        moved = float(np.median(np.linalg.norm(pixels - before, axis=1)))
-        parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))
-        return parallax > limit or moved > _MOST_FLOW * limit
+        limit = _PARALLAX_RATIO if len(local.keyframes) >= _YOUNG_KEYFRAMES else _YOUNG_PARALLAX_RATIO
+        before = last.pixels[np.searchsorted(last.track_ids, track_ids)]
+        moved = float(np.median(np.linalg.norm(pixels - before, axis=1))) / self._intrinsics.width
+        return parallax_ratio > limit or moved > _MOST_FLOW * limit
+
+    def _parallax_ratio(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> float:
+        """The median parallax to the last keyframe over the width of the image."""
+        last, intrinsics = segment.map.keyframes[-1], self._intrinsics
+        if not len(track_ids):
+            return 0.0
+        R = self._state.T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
+        rays_before = intrinsics.rays(last.pixels[np.searchsorted(last.track_ids, track_ids)])
+        parallax = parallax_px(rays_before, intrinsics.rays(pixels.astype(np.float64)), R, intrinsics)
+        return float(np.median(parallax)) / intrinsics.width
 
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""

@@ -46,7 +46,7 @@ def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometryState]:
     """Two maps, and the true poses; on the way back the camera is rolled and closer."""
     walked = there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:30], walked[48:]])
-    return truth, room.tracked(CONFIG.keyframes, truth, [0] * 30 + [9] * 11 + [0] * 51)
+    return truth, room.tracked(CONFIG.keyframes, truth, [0] * 30 + [9] * 9 + [0] * 53)
 
 
 def closed(state: KeyframeOdometryState) -> MapClosure:
@@ -79,7 +79,7 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
     (join,) = after.joins
     assert join.event == "map joined"
     assert join.other is not None
-    assert join.other < 30 < 41 <= join.frame
+    assert join.other < 30 < 39 <= join.frame
     position, rotation = errors(after.poses, truth)
     assert position < 0.01
     assert rotation < 0.3
@@ -174,11 +174,13 @@ def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.Monk
     lengths = {pose.ends: np.linalg.norm(pose.T_from_to[:3, 3]) for pose in learned}
     true = {(a, b): np.linalg.norm(truth[a, :3, 3] - truth[b, :3, 3]) for a, b in lengths}
     units = [length / true[ends] for ends, length in lengths.items() if ends[0] < 30]
+    ratios = []
     for loop in measured:
         assert loop.T_from_to is not None
         T = invert(truth[loop.from_index]) @ truth[loop.to_index]
-        ratio = np.linalg.norm(loop.T_from_to[:3, 3]) / np.linalg.norm(T[:3, 3])
-        assert ratio == pytest.approx(3.0 * np.median(units), rel=0.1)
+        ratios.append(np.linalg.norm(loop.T_from_to[:3, 3]) / np.linalg.norm(T[:3, 3]))
+    assert np.median(ratios) == pytest.approx(3.0 * np.median(units), rel=0.03)
+    assert ratios == pytest.approx(3.0 * np.median(units), rel=0.2)
 
 
 @pytest.mark.slow

@@ -56,3 +56,19 @@ def test_sigmas_are_of_the_size_of_the_errors() -> None:
     ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / np.mean(sigmas, axis=0)
     assert (ratio > 0.6).all()
     assert (ratio < 1.6).all()
+
+
+def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_step() -> None:
+    """All points at wrong depths: the pose is right, with what their parallax is off taken as their uncertainty."""
+    points, pixels = seen(200)
+    first = np.linalg.inv(T_TRUE)[:3, 3] + [0.2, 0.05, 0.0]
+    factor = np.exp(np.random.default_rng(1).normal(0.0, 0.3, (200, 1)))
+    wrong = first + factor * (points - first)
+    exact = resect((T_TRUE,), wrong, pixels, INTRINSICS)
+    known = resect((T_TRUE,), wrong, pixels, INTRINSICS, spread=0.3 * (wrong - first))
+
+    def turned(T: FloatArray) -> float:
+        return float(rotation_angle(T[:3, :3] @ T_TRUE[:3, :3].T))
+
+    assert turned(known.T_camera_world) < 0.3 * turned(exact.T_camera_world)
+    assert np.median(known.residual_px) < 0.5 * np.median(exact.residual_px)

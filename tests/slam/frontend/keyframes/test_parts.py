@@ -86,9 +86,12 @@ def test_keyframes_that_share_no_point_are_in_two_parts() -> None:
         keyframe = local.keyframes[k]
         local.keyframes[k] = keyframe.with_corners(np.arange(len(keyframe.track_ids)), keyframe.track_ids + 1500)
     before, after = parts_of(MapSegment(local, started=True), CAMERA)
-    assert after.map.keyframes[0].index == middle
-    (turn,) = before.turns
-    assert turn.ends == (middle - 1, middle) and turn.sigmas[0] == pytest.approx(np.deg2rad(0.5))
+    assert after.map.keyframes[0].index == middle + 1  # where points of the keyframe before have parallax
+    by_image, by_points = before.turns
+    assert by_image.ends == (middle - 1, middle) and by_points.ends == (middle, middle + 1)
+    assert by_image.sigmas[0] == pytest.approx(np.deg2rad(0.5)) and by_points.sigmas[0] == pytest.approx(
+        np.deg2rad(0.1)
+    )
 
 
 def test_a_map_whose_points_carry_the_unit_is_one_part() -> None:

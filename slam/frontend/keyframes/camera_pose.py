@@ -18,7 +18,7 @@ MIN_POINTS = 20  # least number of points that give a camera its pose
 INLIER_PX = 3.0  # residual of an inlier of a camera's pose, pixels
 _ITERATIONS = 12
 # radians, and units of the map: hundredths of a pixel
-_CONVERGED = 1e-5
+_CONVERGED = 5e-5
 _LEAST_PIXEL_SIGMA = 0.1
 # below this inlier ratio the pose may be one that some wrong tracks agree on
 _DOUBTFUL_RATIO = 0.75

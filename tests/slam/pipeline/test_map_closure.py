@@ -180,7 +180,7 @@ def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.Monk
         T = invert(truth[loop.from_index]) @ truth[loop.to_index]
         ratios.append(np.linalg.norm(loop.T_from_to[:3, 3]) / np.linalg.norm(T[:3, 3]))
     assert np.median(ratios) == pytest.approx(3.0 * np.median(units), rel=0.03)
-    assert ratios == pytest.approx(3.0 * np.median(units), rel=0.2)
+    assert np.mean(np.isclose(ratios, 3.0 * np.median(units), rtol=0.1)) > 0.8
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ _THICKNESS = 0.04  # of the floor, over the camera's height
 _LEAST_RATIO, _LEAST_POINTS = 0.04, 25  # points on the floor, over all, and in number
 _MOST_BELOW = 0.5  # points below the floor over those on it: a table has the floor below it
 _MOST_SPREAD = 0.15  # of the camera's height
-_MOST_CONTRADICTION = np.log(2.0)  # between two units of a map: a table is half as high
+_MOST_CONTRADICTION = np.log(1.4)  # between two units of a map: a table is half as high
 
 
 def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0) -> list[float]:

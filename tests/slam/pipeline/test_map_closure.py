@@ -195,13 +195,17 @@ def test_another_scene_is_no_loop() -> None:
 @pytest.mark.data
 @pytest.mark.slow
 def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
+    """With flat learned depth: no network takes part."""
     recording = data_root / "handheld_kitchen"
     sequence = open_sequence(recording / "images")
     indices = range(0, 320, 4)
     truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)
     odometry = KeyframeOdometry(KeyframesConfig(), sequence.intrinsics)
+    flat = np.ones((sequence.intrinsics.height, sequence.intrinsics.width), np.float32)
     for k in indices:
-        odometry.follow(replace(sequence.frame(k), index=k // 4))
+        frame = replace(sequence.frame(k), index=k // 4)
+        odometry.follow(frame)
+        odometry.learn(frame, flat)
     maps = odometry.state().segments
     before = keyframe_poses(maps, sequence.intrinsics)
     after = close_maps(maps, sequence.intrinsics, SlamConfig())

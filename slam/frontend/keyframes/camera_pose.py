@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from slam.frames import Intrinsics
+from slam.frontend.keyframes.bundle_adjustment import Noise
 from slam.geometry.projection import LEAST_DEPTH, pixel_jacobian
 from slam.geometry.resection import consensus
 from slam.geometry.robust import mad_sigma
@@ -23,7 +24,7 @@ _LEAST_PIXEL_SIGMA = 0.1
 # below this inlier ratio the pose may be one that some wrong tracks agree on
 _DOUBTFUL_RATIO = 0.75
 _SAMPLES = 300
-_PIXEL_SIGMA = 0.7  # of a sighting
+_PIXEL_SIGMA = Noise().pixel  # of a sighting
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,6 @@ def resect(
         seed: of RANSAC.
         spread: one sigma of each point ``(M, 3)``, in the direction in which it is uncertain; None for exact points.
     """
-    spread = np.zeros_like(points) if spread is None else spread
 
     def support(pose: CameraPose) -> int:
         return int((pose.residual_px < INLIER_PX).sum())
@@ -78,7 +78,11 @@ def resect(
 
 
 def _refined(
-    T_camera_world: FloatArray, points: FloatArray, spread: FloatArray, pixels: FloatArray, intrinsics: Intrinsics
+    T_camera_world: FloatArray,
+    points: FloatArray,
+    spread: FloatArray | None,
+    pixels: FloatArray,
+    intrinsics: Intrinsics,
 ) -> CameraPose:
     """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
     T = T_camera_world.copy()
@@ -103,7 +107,7 @@ def _refined(
 
 
 def _whitened(
-    T_camera_world: FloatArray, points: FloatArray, spread: FloatArray, rays: FloatArray, focal: FloatArray
+    T_camera_world: FloatArray, points: FloatArray, spread: FloatArray | None, rays: FloatArray, focal: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals of pixels ``(2, M)``, their derivatives ``(6, 2, M)``, and the points in the camera ``(M, 3)``.
 
@@ -112,6 +116,8 @@ def _whitened(
     X = apply(T_camera_world, points)
     z = np.maximum(X[:, 2], LEAST_DEPTH)
     residual, J = ((X[:, :2] / z[:, None] - rays) * focal).T, pixel_jacobian(X, focal)
+    if spread is None:
+        return residual, J, X
     line = (J[3:] * (spread @ T_camera_world[:3, :3].T).T[:, None]).sum(axis=0)
     square = np.maximum((line**2).sum(axis=0), 1e-9)
     taken = (1.0 - _PIXEL_SIGMA / np.sqrt(_PIXEL_SIGMA**2 + square)) / square

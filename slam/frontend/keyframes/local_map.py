@@ -21,6 +21,7 @@ from slam.geometry.se3 import FloatArray, apply, invert
 TrackIds = NDArray[np.int64]
 
 _IMAGES_KEPT = 20
+_LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
 _MATCHED_LEVELS = 1
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
@@ -124,15 +125,15 @@ class LocalMap:
         """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map."""
         newest = self.keyframes[-1]
         tracks, learned = newest.track_ids, newest.learned_depth
-        ratios = self._ratios(newest)
+        ratios = self.ratios(newest)
         both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
-        unit = unit_for_new(ratios[both], self.parallax(_IMAGES_KEPT).settled[tracks[both]])
+        unit = unit_for_new(ratios[both], self.parallax(_LOOKED_BACK).settled[tracks[both]])
         rays = intrinsics.rays(newest.pixels[new]) * (unit * learned[new, None])
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
 
     def spread(self, intrinsics: Intrinsics) -> FloatArray:
         """One sigma of the newest keyframe's points ``(M, 3)``, along the ray on which each was seen first."""
-        spread = self.parallax(_IMAGES_KEPT).spread(Noise().pixel / intrinsics.fx)
+        spread = self.parallax(_LOOKED_BACK).spread(Noise().pixel / intrinsics.fx)
         return np.nan_to_num(spread[self.keyframes[-1].track_ids])
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
@@ -205,12 +206,12 @@ class LocalMap:
 
     def _prior(self, keyframe: TrackedKeyframe, settled: NDArray[np.bool_]) -> FloatArray:
         """Learned depth of a keyframe's corners ``(M,)`` in the unit of the map; NaN where they have parallax."""
-        ratios, is_settled = self._ratios(keyframe), settled[keyframe.track_ids]
+        ratios, is_settled = self.ratios(keyframe), settled[keyframe.track_ids]
         both = ratios > 0.0
         unit = unit_for_loose(ratios[both], is_settled[both])
         return np.where(both & ~is_settled, unit * keyframe.learned_depth, np.nan)
 
-    def _ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
+    def ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
         """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""
         depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
         learned = np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan)

@@ -42,6 +42,7 @@ _LAST_FRAMES = 4  # frames in which a pose is looked up
 # median parallax that asks for a keyframe, over the image width; in a map of few keyframes
 _PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
 _YOUNG_KEYFRAMES = 4
+_LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -78,8 +79,7 @@ class KeyframeOdometry:
         self._intrinsics = intrinsics
         self._seed = seed
         self._state = KeyframeOdometryState() if state is None else state.copy()
-        self._spread = np.zeros((0, 3))
-        self._measure_spread()
+        self._spread: FloatArray | None = None  # of the points of the last keyframe, once they are looked for
 
     def state(self) -> KeyframeOdometryState:
         """A snapshot to resume from."""
@@ -172,7 +172,7 @@ class KeyframeOdometry:
             return
         local.keyframes[-1] = local.keyframes[-1].with_depth(depth)
         local.add_points(self._intrinsics)
-        self._measure_spread()
+        self._spread = None
         points = int(local.known(local.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
@@ -248,6 +248,8 @@ class KeyframeOdometry:
         T_last = self._state.T_camera_world
         guesses = T_last, self._state.T_last_step @ T_last
         points = segment.map.points[track_ids]
+        if self._spread is None:
+            self._spread = segment.map.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.map.keyframes[-1].track_ids, track_ids)]
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
@@ -257,7 +259,7 @@ class KeyframeOdometry:
         local, before, state = segment.map, segment.map.keyframes[-1], self._state
         rows = np.searchsorted(before.track_ids, track_ids)
         known = local.known(track_ids)
-        if local.parallax(_YOUNG_KEYFRAMES).settled[track_ids].sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
+        if local.parallax(_LOOKED_BACK).settled[track_ids].sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
         tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, local.points[tracks])[:, 2]
@@ -307,12 +309,7 @@ class KeyframeOdometry:
             state.T_camera_world = local.keyframes[-1].T_camera_world
         state.places = local.keyframes[-1].places.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
-        self._measure_spread()
-
-    def _measure_spread(self) -> None:
-        """How uncertain the points of the last keyframe are."""
-        if self._state.segments:
-            self._spread = self._state.segments[-1].map.spread(self._intrinsics)
+        self._spread = None
 
     def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
         """How fast the camera turns, for a rolling shutter."""

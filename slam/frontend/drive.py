@@ -183,17 +183,6 @@ class Drive:
             repeated=[k - first for k in last(reversed(self.repeated), lambda k: k)],
         )
 
-    def with_maps(self, poses: KeyframePoses, joins: Iterable[TrackingEvent]) -> Drive:
-        """The same with poses by joined maps, which also relate segments of the drive that lie in one map."""
-        segments: list[Segment] = []
-        for segment in self.segments:
-            if segments and poses.relates(segment.first):
-                segments[-1] = replace(segments[-1], last=segment.last)
-            else:
-                segments.append(segment)
-        events = sorted([*self.events, *joins], key=lambda event: event.frame)
-        return replace(self, map_poses=poses, segments=segments, events=events)
-
 
 _COLLECTED = (
     *("snippets", "motions", "road_steps", "relative_rotations", "failures", "roads"),

@@ -57,7 +57,7 @@ def complete_drive(
     return replace(
         filled,
         motions=list(smooth_rotations(filled.steps, drive.relative_rotations)),
-        segments=find_segments(len(drive), cuts, filled.interpolated),
+        segments=find_segments(len(drive), cuts, filled.interpolated, map_poses.relates),
         maps=list(maps),
         map_poses=map_poses,
         events=sorted(events, key=lambda event: event.frame),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from slam.frames import Ends, runs
@@ -41,12 +41,18 @@ def find_cuts(
     return sorted(set(cuts))
 
 
-def find_segments(count: int, cuts: Collection[int], interpolated: Mapping[int, str]) -> list[Segment]:
-    """The segments of a drive of so many frames, by its cuts and its long gaps."""
-    begins = {0: ""} | dict.fromkeys(cuts, "it shows another place than the frame before")
-    ends = {count - 1} | {cut - 1 for cut in cuts}
+def find_segments(
+    count: int, cuts: Collection[int], interpolated: Mapping[int, str], is_related: Callable[[int], bool]
+) -> list[Segment]:
+    """The segments of a drive of so many frames, by its cuts and its long gaps.
+
+    ``is_related`` tells of a frame whether a map of keyframes relates the frames from it on to those before.
+    """
+    between = [cut for cut in cuts if not is_related(cut)]
+    begins = {0: ""} | dict.fromkeys(between, "it shows another place than the frame before")
+    ends = {count - 1} | {cut - 1 for cut in between}
     for first, last in runs(interpolated):
-        if last - first + 1 > _LONGEST_GAP and first > 0 and last + 1 < count:
+        if last - first + 1 > _LONGEST_GAP and first > 0 and last + 1 < count and not is_related(last + 1):
             ends.add(first - 1)
             begins[last + 1] = f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
     return [Segment(first, last, begins[first]) for first, last in zip(sorted(begins), sorted(ends), strict=True)]

@@ -49,10 +49,10 @@ class MapLoop:
 class MapLoops:
     """Loops ``found`` among so many ``candidates``, of which so many were ``measured``; rejected ones by frames."""
 
-    candidates: int
-    measured: int
-    found: tuple[MapLoop, ...]
-    rejected: tuple[RejectedLoop, ...]
+    candidates: int = 0
+    measured: int = 0
+    found: tuple[MapLoop, ...] = ()
+    rejected: tuple[RejectedLoop, ...] = ()
 
 
 def find_map_loops(

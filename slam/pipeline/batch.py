@@ -43,7 +43,7 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.input_checks import require_possible
 from slam.pipeline.keyframe_depth import KeyframeDepths
-from slam.pipeline.map_closure import MapClosure, close_maps
+from slam.pipeline.map_closure import MapClosure
 from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.runtime.errors import SequenceError
@@ -129,16 +129,15 @@ class SlamPipeline:
         self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        drive, state = self._observe(checkpoints, frames, watch)
+        drive, closure, state = self._observe(checkpoints, frames, watch)
         self._progress("loops and graph", 0, 1)
-        drive, closure = self.close_maps(drive)
         warn_of_doubts(drive, state.gate)
-        estimate = self.solve(drive, state, closure)
+        estimate = self.solve(drive, closure, state)
         self._progress("loops and graph", 1, 1)
         return estimate
 
-    def solve(self, drive: Drive, state: FrontEndState, closure: MapClosure | None = None) -> Estimate:
-        """Lengths, factors and loops of a drive after `close_maps`, and the trajectory that fits them.
+    def solve(self, drive: Drive, closure: MapClosure, state: FrontEndState) -> Estimate:
+        """Lengths, factors and loops of a completed drive and its closed maps, and the trajectory that fits them.
 
         Raises:
             SlamError: the graph has no solution.
@@ -155,12 +154,12 @@ class SlamPipeline:
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
-        if closure is None:
+        if drive.maps and self._config.loops.enabled:
+            loops = closure.closures(scale)
+        else:
             with self._watch.stage("loops"):
                 camera, config = self._sequence.intrinsics, self._config.loops
                 loops = close_loops(views, T_odometry, camera, config, scale.is_metric, self._seed)
-        else:
-            loops = closure.closures(scale)
         graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
         if self._positioning is not None and self._positioning.agreement is not None:
             by_gps = self._positioning.agreement
@@ -221,14 +220,6 @@ class SlamPipeline:
             T_odometry = chain_odometry(factors, T_network, scale)
         return scale, factors, T_odometry
 
-    def close_maps(self, drive: Drive) -> tuple[Drive, MapClosure | None]:
-        """A completed drive with its maps joined by loops among all keyframes; None without maps."""
-        if not drive.maps or not self._config.loops.enabled:
-            return drive, None
-        with self._watch.stage("loops"):
-            closure = close_maps(drive.maps, self._sequence.intrinsics, self._config, self._seed)
-        return drive.with_maps(closure.poses, closure.joins), closure
-
     def fuse(
         self,
         estimate: Estimate,
@@ -284,7 +275,7 @@ class SlamPipeline:
         checkpoints: CheckpointWriter | None,
         frames: Iterator[Frame] | None,
         watch: Callable[[Observer], None] | None,
-    ) -> tuple[Drive, FrontEndState]:
+    ) -> tuple[Drive, MapClosure, FrontEndState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
         state = None if checkpoint is None else checkpoint.state
@@ -312,10 +303,10 @@ class SlamPipeline:
                 if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 != total:
                     with self._watch.stage("journal"):
                         checkpoints.keep(observer.state())
-            drive, state = observer.complete_drive(), observer.state()
+            (drive, closure), state = observer.complete_drive(), observer.state()
         if isinstance(self._sequence, Continued):
             warn_of_another_place(drive, first)
-        return drive, state
+        return drive, closure, state
 
     def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry, by what the mode knows of the drive."""

@@ -17,7 +17,6 @@ from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
 from slam.frontend.keyframes.parts import parts_of
-from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.unit import learned_unit
 from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
@@ -158,10 +157,6 @@ class KeyframeTracking:
     def events(self) -> Sequence[TrackingEvent]:
         """What became of the maps so far."""
         return () if self._odometry is None else self._odometry.events
-
-    def poses(self, maps: Sequence[MapSegment]) -> KeyframePoses:
-        """Relative poses of all frames of some maps."""
-        return keyframe_poses(maps, self._intrinsics, self._seed)
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:

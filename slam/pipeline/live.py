@@ -249,8 +249,7 @@ class Slam:
         self._observer.flush()
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        drive, closure = self._pipeline.close_maps(self._observer.complete_drive())
-        estimate = self._pipeline.solve(drive, self._observer.state(), closure)
+        estimate = self._pipeline.solve(*self._observer.complete_drive(), self._observer.state())
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         self._estimate = estimate
         return estimate.loops

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slam.config.sections import SlamConfig
+from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import depth_units, scaled_poses
 from slam.frontend.keyframes.joining import SharedCorners, join
@@ -23,7 +23,7 @@ from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, apply, invert, make
 from slam.graph.similarity_graph import optimise_similarities
 from slam.loops.closure import LoopClosures
-from slam.loops.maps import MapLoop, find_map_loops
+from slam.loops.maps import MapLoop, MapLoops, find_map_loops
 from slam.loops.verification import Loop, RejectedLoop
 
 logger = logging.getLogger(__name__)
@@ -66,20 +66,22 @@ class MapClosure:
         return LoopClosures(self.candidates, self.measured, tuple(accepted), tuple(rejected))
 
 
-def close_maps(maps: Sequence[MapSegment], intrinsics: Intrinsics, config: SlamConfig, seed: int = 0) -> MapClosure:
+def close_maps(maps: Sequence[MapSegment], intrinsics: Intrinsics, config: LoopsConfig, seed: int = 0) -> MapClosure:
     """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
 
     Args:
         maps: of one drive, in time order; they stay as they are.
         intrinsics: of all images.
-        config: of loops and keyframes.
+        config: whether loops are sought.
         seed: of RANSAC.
     """
     maps = [segment for segment in maps if segment.started]
     rows = _Rows(maps)
     if not maps:
         return MapClosure(KeyframePoses())
-    found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, seed)
+    found = MapLoops()
+    if config.enabled:
+        found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, seed)
     loops, rejected = list(found.found), list(found.rejected)
     while True:
         closed, wrong = _closed(rows, loops, intrinsics)

@@ -27,6 +27,7 @@ from slam.geometry.se3 import FloatArray, chain
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.pipeline.keyframe_tracking import KeyframeTracking
+from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.pending import PendingFrame, PendingTask, has_moved_on, height_of, last_step, predicted_depth
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.memory import return_freed_memory
@@ -69,7 +70,7 @@ class Observer:
             camera_height_m: above the road; None where unknown.
         """
         self._predictor = predictor
-        self._config = config
+        self._config, self._intrinsics, self._seed = config, intrinsics, seed
         self._stopwatch = stopwatch
         self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate)
@@ -158,16 +159,18 @@ class Observer:
         """As `KeyframeTracking.step`, of a finished frame."""
         return self._keyframes.step(index)
 
-    def complete_drive(self) -> Drive:
-        """Everything measured so far with its gaps interpolated; more frames may follow.
+    def complete_drive(self) -> tuple[Drive, MapClosure]:
+        """Everything measured so far with its gaps interpolated, and its maps closed; more frames may follow.
 
         Raises:
             SlamError: no snippet of usable frames.
         """
         self.flush()
         maps = self._keyframes.maps(self._drive)
-        poses = self._keyframes.poses(maps)
-        return complete_drive(self._drive, self._predictor.sources, maps, poses, self._keyframes.events)
+        with self._stopwatch.stage("loops"):
+            closure = close_maps(maps, self._intrinsics, self._config.loops, self._seed)
+        events = [*self._keyframes.events, *closure.joins]
+        return complete_drive(self._drive, self._predictor.sources, maps, closure.poses, events), closure
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""

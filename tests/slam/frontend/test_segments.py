@@ -17,12 +17,19 @@ def test_a_single_failed_step_between_measured_ones_is_a_cut() -> None:
     assert find_cuts([(3, 5, "")], measured, ()) == []
 
 
-def test_segments_begin_at_cuts_and_after_long_gaps() -> None:
-    assert find_segments(10, [], {}) == [Segment(0, 9, "")]
+def test_segments_begin_at_cuts_and_after_long_gaps_that_no_map_of_keyframes_relates() -> None:
+    def never(_: int) -> bool:
+        return False
+
+    assert find_segments(10, [], {}, never) == [Segment(0, 9, "")]
     dark = dict.fromkeys(range(100, 140), "blank")
-    assert find_segments(200, [50], dark) == [
+    assert find_segments(200, [50], dark, never) == [
         Segment(0, 49, ""),
         Segment(50, 99, "it shows another place than the frame before"),
         Segment(140, 199, "40 frames before it are interpolated: blank"),
     ]
-    assert len(find_segments(200, [], dict.fromkeys(range(100, 120), "blank"))) == 1
+    assert len(find_segments(200, [], dict.fromkeys(range(100, 120), "blank"), never)) == 1
+    assert find_segments(200, [50], dark, lambda first: first == 140) == [
+        Segment(0, 49, ""),
+        Segment(50, 199, "it shows another place than the frame before"),
+    ]

@@ -74,7 +74,7 @@ def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
         for k, T in enumerate(truth):
             frame = room.frame(k, T)
             observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
-        closed = observer.complete_drive()
+        closed, _ = observer.complete_drive()
     started = min(closed.map_poses.segments)
     assert started < 10 and len(closed.map_poses.segments) == 40 - len(blank) - started
     late = [motion.ends for motion in observer.drive.motions if motion.ends[0] > 19]
@@ -98,7 +98,7 @@ def test_depth_is_predicted_for_all_keyframes_and_few_other_frames(interrupted: 
             observer.add(k, room.frame(k, T))
             if k in interrupted:
                 observer.state()
-        state, closed = observer.state(), observer.complete_drive()
+        state, (closed, _) = observer.state(), observer.complete_drive()
     assert state.keyframes is not None
     keyframes = state.keyframes.segments[-1].map.keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)

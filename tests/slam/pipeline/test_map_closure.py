@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.config.sections import KeyframesConfig, SlamConfig
+from slam.config.sections import KeyframesConfig, LoopsConfig, SlamConfig
 from slam.frames import RelativeSimilarity, View
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
@@ -50,7 +50,7 @@ def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometryState]:
 
 
 def closed(state: KeyframeOdometryState) -> MapClosure:
-    return close_maps(state.segments, room.INTRINSICS, CONFIG)
+    return close_maps(state.segments, room.INTRINSICS, CONFIG.loops)
 
 
 def errors(found: KeyframePoses, truth: FloatArray) -> tuple[float, float]:
@@ -126,7 +126,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     assert (found.event, found.frame) == ("relocalised", 66)
     assert found.other is not None
     assert found.other < 40
-    poses = tracking.poses(state.segments)
+    poses = keyframe_poses(state.segments, room.INTRINSICS)
     assert set(poses.segments) == {*range(60), *range(66, 88)}
     position, rotation = errors(poses, truth)
     assert position < 0.01
@@ -208,7 +208,7 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
         odometry.learn(frame, flat)
     maps = odometry.state().segments
     before = keyframe_poses(maps, sequence.intrinsics)
-    after = close_maps(maps, sequence.intrinsics, SlamConfig())
+    after = close_maps(maps, sequence.intrinsics, LoopsConfig())
     T_world_camera = np.tile(np.eye(4), (len(truth), 1, 1))
     T_world_camera[:, :3] = truth
     assert sorted(before.segments) == list(range(80))

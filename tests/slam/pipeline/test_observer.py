@@ -289,7 +289,7 @@ def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_p
 
 def assert_same(one: Observer, other: Observer) -> None:
     """Both have measured the same bytes, of every kind."""
-    first, second = one.complete_drive(), other.complete_drive()
+    (first, _), (second, _) = one.complete_drive(), other.complete_drive()
     assert len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 15
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from slam.geometry.robust import mad_sigma
-from slam.geometry.se3 import FloatArray, make
+from slam.geometry.se3 import FloatArray, make, rotation_matrix
 
 _CONFIDENCE = 0.999
 _LEAST_PIXEL_SIGMA = 0.1
@@ -78,5 +77,5 @@ def refine(
     sigma = max(mad_sigma((projected.reshape(-1, 2) - pixels).ravel()), _LEAST_PIXEL_SIGMA)
     J = jacobian[:, :6]
     sigmas = sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6))))
-    T_camera_points = make(Rotation.from_rotvec(rotation.ravel()).as_matrix(), translation.ravel())
+    T_camera_points = make(rotation_matrix(rotation), translation.ravel())
     return Resection(T_camera_points, inliers, np.asarray(sigmas))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -76,6 +77,11 @@ def nearest_rotation(M: FloatArray) -> FloatArray:
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     R: FloatArray = U @ Vt
     return R
+
+
+def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
+    """``R_a_b`` ``(3, 3)`` from one axis times angle in radians ``(3,)``, in a twentieth of the time of SciPy's."""
+    return np.asarray(cv2.Rodrigues(rotation_vector)[0])
 
 
 def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> FloatArray:

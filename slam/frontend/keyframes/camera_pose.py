@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import Noise
 from slam.geometry.projection import LEAST_DEPTH, pixel_jacobian
 from slam.geometry.resection import consensus
-from slam.geometry.robust import mad_sigma
-from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, make
+from slam.geometry.robust import mad_sigma, median
+from slam.geometry.se3 import FloatArray, apply, make, rotation_matrix
 
 MIN_POINTS = 20  # least number of points that give a camera its pose
 INLIER_PX = 3.0  # residual of an inlier of a camera's pose, pixels
@@ -72,7 +71,7 @@ def resect(
     if support(best) < _DOUBTFUL_RATIO * len(points):
         found = consensus(points, pixels, intrinsics.K, _SAMPLES, INLIER_PX, seed)
         if found is not None:
-            start = make(cv2.Rodrigues(found[0])[0], found[1])
+            start = make(rotation_matrix(found[0]), found[1])
             best = max(best, _refined(start, points, spread, pixels, intrinsics), key=support)
     return best
 
@@ -91,12 +90,12 @@ def _refined(
     residual, J, X = _whitened(T, points, spread, rays, focal)
     for _ in range(_ITERATIONS):
         norm = np.hypot(*residual)
-        scale = max(0.5 * INLIER_PX, float(np.median(norm)))
+        scale = max(0.5 * INLIER_PX, median(norm))
         weight = np.where(X[:, 2] > LEAST_DEPTH, 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
         weighted = (weight * J).reshape(6, -1)
         information = weighted @ J.reshape(6, -1).T + 1e-9 * np.eye(6)
         step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
-        T = from_rotation_vector(step[:3], step[3:]) @ T
+        T = make(rotation_matrix(step[:3]), step[3:]) @ T
         residual, J, X = _whitened(T, points, spread, rays, focal)
         if np.abs(step).max() < _CONVERGED:
             break

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Grey, Intrinsics
-from slam.geometry.se3 import FloatArray, from_rotation_vector
+from slam.geometry.se3 import FloatArray, rotation_matrix
 
 _REDUCED = 8  # an image over the small one
 _COARSE = 2  # a small image over the one that all guesses are tried on
@@ -62,7 +62,7 @@ def image_turn(
         coarse = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (before, now))
         pairs.insert(0, (*coarse, scale / _COARSE))
     yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
-    R_shift = from_rotation_vector(np.array([-pitch, yaw, 0.0]), np.zeros(3))[:3, :3]
+    R_shift = rotation_matrix(np.array([-pitch, yaw, 0.0]))
     found = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
     for first, second, each in pairs:
         problem = _Alignment(first, second, intrinsics, each)
@@ -100,7 +100,7 @@ class _Alignment:
             weighted = self._jacobian * (inside / (1.0 + (residual / _OUTLIER) ** 2))
             information = weighted @ self._jacobian.T + 1e-6 * np.eye(3)
             step = np.linalg.solve(information, weighted @ residual)
-            R = R @ from_rotation_vector(-step, np.zeros(3))[:3, :3]
+            R = R @ rotation_matrix(-step)
             if np.abs(step).max() < _CONVERGED:
                 break
         turned, inside = self._turned(R)

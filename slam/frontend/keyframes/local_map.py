@@ -32,8 +32,9 @@ _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
-# a point that two keyframes do not find is hidden
-_ATTEMPTS = 2
+# a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so are those that remain
+_ATTEMPTS, _MISSES = 2, 3
+_LEAST_FOUND = 0.02
 # most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
 # ten times; but in a young map, depth and motion change together for long at hardly any cost
 _LIMITS, _YOUNG_LIMITS = (12, 1e-3), (60, 1e-6)
@@ -244,7 +245,7 @@ class LocalMap:
         """Known points that are not among the tracks of a new keyframe, found near their projections."""
         attempts = np.where(np.isfinite(self.points[:, 0]), _ATTEMPTS, 0)
         attempts[track_ids] = 0
-        tracks, places = [], []
+        tracks, places, misses = [], [], 0
         for keyframe in self._near(T_camera_world, track_ids):
             rows = np.flatnonzero(attempts[keyframe.track_ids])
             X = apply(T_camera_world, self.points[keyframe.track_ids[rows]])
@@ -262,6 +263,9 @@ class LocalMap:
             places.append(found[kept])
             attempts[keyframe.track_ids[rows]] -= 1
             attempts[tracks[-1]] = 0
+            misses = misses + 1 if kept.sum() < _LEAST_FOUND * len(rows) else 0
+            if misses == _MISSES:
+                break
         if not tracks:
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         return np.concatenate(tracks), np.concatenate(places)

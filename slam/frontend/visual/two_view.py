@@ -14,7 +14,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from slam.config.sections import VisualOdometryConfig
 from slam.frontend.visual.epipolar import (
@@ -27,7 +26,7 @@ from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
 from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry.robust import mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, rotation_matrix
 
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
@@ -169,11 +168,11 @@ class TwoViewEstimator:
             deviation = unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
             normal[3:5, 3:5] += np.eye(2) / prior.axis_sigma**2
             gradient[3:5] += tangent.T @ deviation / prior.axis_sigma**2
-            step = -_OVERSTEP * np.linalg.solve(normal, gradient)
+            step = np.asarray(-_OVERSTEP * np.linalg.solve(normal, gradient), np.float64)
             if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < _CONVERGED:
                 break
             direction = unit_pose.direction + tangent @ step[3:5]
-            R_current_previous = Rotation.from_rotvec(step[:3]).as_matrix() @ unit_pose.R_current_previous
+            R_current_previous = rotation_matrix(step[:3]) @ unit_pose.R_current_previous
             unit_pose = UnitRelativePose(R_current_previous, direction / np.linalg.norm(direction))
             length = max(length + float(step[5]), 0.2 * length)
         lift = np.zeros((6, 5))

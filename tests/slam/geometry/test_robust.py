@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.geometry.robust import mad_sigma, mad_sigmas, weighted_median
+from slam.geometry.robust import mad_sigma, mad_sigmas, median, weighted_median
 
 
 def test_the_sigma_of_normal_errors_survives_a_third_of_outliers() -> None:
@@ -13,6 +13,17 @@ def test_the_sigma_of_normal_errors_survives_a_third_of_outliers() -> None:
     assert mad_sigmas(errors) == pytest.approx([2.0, 2.0], rel=0.02)
     spoilt = np.concatenate([errors[:, 0], np.full(2_000, 1e6)])
     assert mad_sigma(spoilt) == pytest.approx(2.0, rel=0.2)
+
+
+@pytest.mark.parametrize("shape", [(1,), (2,), (7, 3), (8, 5)])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_the_median_is_that_of_numpy(shape: tuple[int, ...], kind: type) -> None:
+    values = np.random.default_rng(0).normal(size=shape).astype(kind)
+    assert median(values) == np.median(values)
+
+
+def test_nothing_has_no_median() -> None:
+    assert np.isnan(median(np.zeros(0)))
 
 
 def test_a_weighted_median_is_where_half_of_the_weight_lies() -> None:

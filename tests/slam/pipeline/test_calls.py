@@ -9,9 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import room
 from oracle import OracleNoise, OraclePredictor
 
-from slam.config.sections import load_config
+from slam.config.sections import KeyframesConfig, load_config
 from slam.loops.descriptors import FeatureExtractor
 from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.fusion import Fusion
@@ -62,3 +63,11 @@ def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
     a_frame = {name: calls[name] / FRAMES for name in MOST}
     assert all(a_frame.values())
     assert {name: calls for name, calls in a_frame.items() if calls > MOST[name]} == {}
+
+
+def test_calls_a_frame_of_a_hand_held_camera(monkeypatch: pytest.MonkeyPatch):
+    """Two searches of corners for the frame; for a keyframe, two in each keyframe that still finds some of them."""
+    truth, calls = room.walk(60), Counter[str]()
+    monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", counted(calls, "flow", cv2.calcOpticalFlowPyrLK))
+    keyframes = room.tracked(KeyframesConfig(), truth).segments[-1].map.keyframes
+    assert 0 < calls["flow"] <= 2 * len(truth) + 12 * len(keyframes)

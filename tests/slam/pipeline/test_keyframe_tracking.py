@@ -1,9 +1,9 @@
-import importlib.util
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import room
 from oracle import OraclePredictor
 
 from slam import Slam
@@ -19,12 +19,6 @@ from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
 from slam.pipeline.observer import Observer
 from slam.runtime.timing import Stopwatch
-
-_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "keyframes" / "room.py")
-assert _SPEC is not None
-assert _SPEC.loader is not None
-room = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(room)
 
 
 def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:

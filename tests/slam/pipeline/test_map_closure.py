@@ -1,5 +1,4 @@
 import functools
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import room
 from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig, LoopsConfig, SlamConfig
@@ -22,12 +22,6 @@ from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.sequences.catalogue import open_sequence
-
-_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "keyframes" / "room.py")
-assert _SPEC is not None
-assert _SPEC.loader is not None
-room = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(room)
 
 CONFIG = SlamConfig(keyframes=KeyframesConfig(max_corners=400))
 

@@ -1,10 +1,10 @@
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import room
 
 from slam.config.sections import KeyframesConfig
 from slam.frames import KEYFRAME_SOURCE, RelativePose, TrackingEvent
@@ -14,12 +14,6 @@ from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryS
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.runtime.storage.serialisation import Serialiser
-
-_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).with_name("room.py"))
-assert _SPEC is not None
-assert _SPEC.loader is not None
-room = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(room)
 
 CONFIG = KeyframesConfig(max_corners=200)
 

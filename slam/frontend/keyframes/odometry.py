@@ -305,7 +305,8 @@ class KeyframeOdometry:
         middle, descriptors = in_middle_row(places, state.turn, intrinsics), describe(frame.grey, places)
         local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
         if is_tracked:
-            local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
+            gone = local.adjust(intrinsics)
+            local.keyframes[-1] = local.keyframes[-1].without(gone)
             state.T_camera_world = local.keyframes[-1].T_camera_world
         state.places = local.keyframes[-1].places.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)

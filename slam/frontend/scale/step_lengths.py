@@ -32,6 +32,8 @@ _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
 _MOST_CORRELATED = 0.999
 _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated points
+# factor on the sigma of a length by learned depth where the road gives it too: that has no errors that neighbours share
+_BESIDE_ROAD = 4.0
 _UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
 _UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
 _ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
@@ -128,11 +130,12 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
     steps = len(evidence.learned)
     lengths, units = np.arange(steps), steps + np.arange(steps)
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, config.ratio_sigma)
+    learned_sigma = config.learned_sigma * np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
     rows = [
         _Rows(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         _Rows(lengths, None, evidence.absolute, evidence.absolute_sigma),
-        _Rows(lengths, units, evidence.learned, config.learned_sigma * ones),
+        _Rows(lengths, units, evidence.learned, learned_sigma),
         _Rows(lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
         _Rows(units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
         # one prior on the unit of the whole drive, divided among its steps

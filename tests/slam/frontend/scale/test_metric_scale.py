@@ -115,7 +115,7 @@ def test_steps_that_skip_frames_have_lengths_by_their_two_frames():
     steps = [*SINGLE[:15], *((k, k + 3) for k in range(15, 39, 3)), (39, 40), *SINGLE[45:]]
     scale = find("camera-height", measured(bias=0.7, steps=steps))
     assert_lengths(scale, {ends: metres(ends) for ends in steps}, rtol=0.02)
-    np.testing.assert_allclose(scale.per_frame, 1 / UNIT, rtol=0.03)
+    np.testing.assert_allclose(scale.per_frame, 1 / UNIT, rtol=0.04)  # of 36 %: few steps against the learned road
     assert scale.estimate.frames_used == len(steps)
     unscaled = find("camera-height", measured(road=False, planes=False, steps=steps))
     assert_lengths(unscaled, {ends: UNIT * metres(ends) for ends in steps}, rtol=1e-6)

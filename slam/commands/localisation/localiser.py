@@ -21,7 +21,7 @@ from slam.config.sections import LoopsConfig, load_stored
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.frontend.keyframes.camera_pose import CameraPose, resect
 from slam.geometry.resection import consensus
-from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_matrix
 from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
@@ -188,7 +188,7 @@ class Localiser:
         self, start: tuple[FloatArray, FloatArray, NDArray[np.intp]], rows: list[int], view: View, learned: bool
     ) -> _Pose | str:
         """The pose by all corners of the map around a first one; or why it is none."""
-        T_camera_world = make(cv2.Rodrigues(start[0])[0], start[1])
+        T_camera_world = make(rotation_matrix(start[0]), start[1])
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)

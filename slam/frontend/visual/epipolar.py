@@ -13,7 +13,7 @@ import numpy as np
 
 from slam.frames import Intrinsics
 from slam.geometry.resection import consensus, ransac_order
-from slam.geometry.se3 import FloatArray, invert, nearest_rotation
+from slam.geometry.se3 import FloatArray, invert, nearest_rotation, rotation_matrix
 
 _TRIMMINGS = 4
 _RESECTIONS = 200
@@ -111,7 +111,7 @@ def unit_pose_by_pnp(
         return None
     rotation, translation, _ = found
     length = float(np.linalg.norm(translation))
-    return UnitRelativePose(cv2.Rodrigues(rotation)[0], translation / length) if length > 0 else None
+    return UnitRelativePose(rotation_matrix(rotation), translation / length) if length > 0 else None
 
 
 def parallax_px(

@@ -95,9 +95,14 @@ class DepthConfig(Section):
     fusion: str = Field(default="default", description="learned: default, or an output folder of erfsfm train-fusion")
 
     @property
+    def is_learned(self) -> bool:
+        """Whether a network gives the depth, not files."""
+        return not self.source.startswith(("npy:", "png:"))
+
+    @property
     def predicted_stride(self) -> int:
         """Frames between those whose depth is asked for: files have one for each."""
-        return 1 if self.source.startswith(("npy:", "png:")) else self.frame_stride
+        return self.frame_stride if self.is_learned else 1
 
     @field_validator("source")
     @classmethod

@@ -25,8 +25,7 @@ FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agre
 class KeyframeDepth:
     """A frame to fuse: depth ``(H, W)``, not positive where unknown, its relative sigma or None, its image and pose.
 
-    The depth was refined where it has a sigma. ``network_depth`` ``(H, W)`` is the network's own, None where that is
-    the depth to fuse.
+    ``network_depth`` ``(H, W)`` is the network's own, None where that is the depth to fuse.
     """
 
     frame: int

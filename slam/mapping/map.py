@@ -83,11 +83,13 @@ class TsdfMap:
         self._waiting: KeyframeDepth | None = None
         self._stretch: _Stretch | None = None
         self._views_of_submaps: list[NDArray[np.int64]] = []
-        self._fused = 0
+        self._fused = self._left_out = 0
         self._surface: MapSurface | None = None
 
     def integrate(self, keyframe: KeyframeDepth) -> None:
         """Take a depth map, and fuse the one before it, filtered by its neighbours.
+
+        One without any depth that is certain enough is left out.
 
         Raises:
             RunError: a submap cannot be written.
@@ -98,6 +100,9 @@ class TsdfMap:
         known = np.isfinite(depth) & (depth > 0)
         known_depth = np.where(known, depth, np.float32(0)).astype(np.float32)
         view = replace(keyframe, depth=known_depth, network_depth=None)
+        if not self._filters.trusted(view).any():
+            self._left_out += 1
+            return
         self._fuse_waiting(view)
         self._waiting = view
 
@@ -122,6 +127,11 @@ class TsdfMap:
             SlamError: a submap cannot be written, or the disk is full.
         """
         self._fuse_waiting(None)
+        if self._left_out and not self._fused:
+            raise EmptyMapError(
+                f"the map is empty: none of {self._left_out} keyframes has depth that is certain to "
+                f"mapping.max_relative_sigma={self._config.max_relative_sigma:g}; more fuses what networks guess"
+            )
         if self._surface is None:
             self._finish_submap()
             self._surface = MapSurface(submap_paths(self._folder), self._config, progress)
@@ -145,13 +155,13 @@ class TsdfMap:
     def statistics(self) -> MapStatistics:
         """Counts of all that was given so far, zero for an empty map."""
         self._fuse_waiting(None)
-        filters, voxel_size = self._filters.shares(), self.voxel_size
+        frames, filters = (self._fused, self._left_out), self._filters.shares()
         try:
             surface = self.surface()
         except EmptyMapError:
-            return MapStatistics(0, 0, 0, len(self._views_of_submaps), self._fused, 0, voxel_size, filters, 0.0)
+            return MapStatistics(0, 0, 0, len(self._views_of_submaps), *frames, self.voxel_size, filters, 0.0)
         sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
-        return MapStatistics(*sizes, self._fused, 0, voxel_size, filters, surface.floater_share)
+        return MapStatistics(*sizes, *frames, self.voxel_size, filters, surface.floater_share)
 
     def _has_moved(self, T_world_camera: FloatArray, T_world_previous: FloatArray) -> bool:
         T_previous_camera = invert(T_world_previous) @ T_world_camera

@@ -30,6 +30,7 @@ from slam.frontend.scale.scale_estimate import (
     scale_from_distance,
     scale_from_reference,
 )
+from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
@@ -42,7 +43,7 @@ from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_doubts
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.input_checks import require_possible
-from slam.pipeline.keyframe_depth import KeyframeDepths
+from slam.pipeline.keyframe_depth import ROOM_SIGMA, KeyframeDepths
 from slam.pipeline.map_closure import MapClosure
 from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
@@ -228,6 +229,9 @@ class SlamPipeline:
     ) -> TsdfMap | None:
         """Learned depth at the optimised poses, refined and fused into one surface; None where mapping is switched off.
 
+        A camera that is carried turns on the spot, where nothing measures learned depth. The error of that over
+        distance is known by steps, which measure only the first frames there, and is not taken out.
+
         ``compare`` is called with the depth of each keyframe that is far enough from the one before; ``folder`` is
         where finished submaps go, a temporary folder where it is None.
         """
@@ -238,8 +242,10 @@ class SlamPipeline:
         intrinsics = self._sequence.intrinsics.resized(width, height)
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
-        scales, error = estimate.scale.per_frame, estimate.state.odometry.depth_error
-        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, self._decide)
+        scales, is_carried = estimate.scale.per_frame, bool(estimate.drive.maps)
+        error = DepthError() if is_carried else estimate.state.odometry.depth_error
+        guess_sigma = ROOM_SIGMA if is_carried and config.depth.is_learned else None
+        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, self._decide, guess_sigma)
         mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
         selected = tsdf_map.select([keyframe.index for keyframe in keyframes], T_world_camera)

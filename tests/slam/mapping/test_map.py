@@ -48,6 +48,27 @@ def street_map(noise=lambda depth, k: depth, frames: int = 12, **config) -> Tsdf
     return tsdf_map
 
 
+def test_keyframes_that_are_uncertain_everywhere_are_left_out_and_hide_no_neighbour():
+    def drive(certain: range) -> TsdfMap:
+        tsdf_map = TsdfMap(MappingConfig(max_relative_sigma=0.3), CAMERA)
+        for k in range(9):
+            T_world_camera, is_certain = pose(0.0, 0.0, float(k)), k in certain
+            depth = street(T_world_camera[:3, 3]) * np.float32(1.0 if is_certain else 1.4)
+            sigma = np.full_like(depth, 0.05 if is_certain else 0.32)
+            tsdf_map.integrate(KeyframeDepth(k, depth, sigma, GREY, T_world_camera))
+        return tsdf_map
+
+    tsdf_map = drive(range(0, 9, 2))
+    statistics = tsdf_map.statistics()
+    assert (statistics.frames_fused, statistics.frames_left_out) == (5, 4)
+    assert statistics.filters["agreement"] < 0.2
+    assert np.quantile(distance_to_street(tsdf_map.mesh().points), 0.99) < 0.1
+    nothing = drive(range(0))
+    assert nothing.statistics().frames_left_out == 9
+    with pytest.raises(SlamError, match=r"none of 9 keyframes .* mapping.max_relative_sigma=0.3"):
+        nothing.surface()
+
+
 def test_one_wall_lands_where_the_camera_saw_it():
     # Open3D wants T_camera_world: with the inverse the plate would lie at x = -1
     tsdf_map = TsdfMap(MappingConfig(min_weight=2, min_component_triangles=10), CAMERA)

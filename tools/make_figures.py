@@ -2,6 +2,7 @@
 
 Example: python tools/make_figures.py results/latest docs/images/demo.png
 Example: python tools/make_figures.py results/latest docs/images/map-0013.jpg --dataset DRIVE_0013 --seat 80
+Example: python tools/make_figures.py results/latest docs/images/map-rooms.jpg --dataset HOUSE --seat 20 70
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ NEAR_M = 100.0
 
 @one_line_errors()
 def main() -> None:
-    """One picture: depth of some frames above the trajectories and the map, or a frame above the map from its seat."""
+    """One picture: depth of some frames above trajectories and map, or frames above the map as they see it."""
     parser = parser_of(__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("output", type=Path)
     parser.add_argument("--dataset", type=Path, help="of the run; default: the embedded sequence")
     parser.add_argument("--sequence")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--seat", type=int, metavar="FRAME", help="the map from the driver's seat, below this frame")
+    parser.add_argument("--seat", type=int, nargs="+", metavar="FRAME", help="the map as these see it, below them")
     arguments = parser.parse_args()
 
     folder = RunFolder.open(arguments.run)
@@ -45,7 +46,9 @@ def main() -> None:
     if arguments.seat is None:
         picture = overview(folder, sequence, DepthPosePredictor.from_weights(arguments.weights))
     else:
-        picture = seat(folder, sequence, arguments.seat)
+        picture = np.hstack([seat(folder, sequence, frame) for frame in arguments.seat])
+        if picture.shape[1] > WIDTH_PX:
+            picture = _narrowed(picture, WIDTH_PX)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     small = [cv2.IMWRITE_PNG_COMPRESSION, 9] if arguments.output.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 85]
     cv2.imwrite(str(arguments.output), picture[..., ::-1], small)

@@ -53,7 +53,7 @@ def complete_drive(
     map_poses = map_poses or KeyframePoses()
     measured = {*drive.steps.motions, *map_poses.steps}
     cuts = find_cuts(drive.failures, measured, {*drive.unusable, *drive.repeated})
-    filled = interpolate_gaps(drive, sources, cuts)
+    filled = interpolate_gaps(drive, sources, cuts, map_poses)
     return replace(
         filled,
         motions=list(smooth_rotations(filled.steps, drive.relative_rotations)),
@@ -64,13 +64,16 @@ def complete_drive(
     )
 
 
-def interpolate_gaps(drive: Drive, sources: int, cuts: Collection[int] = ()) -> Drive:
+def interpolate_gaps(
+    drive: Drive, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses | None = None
+) -> Drive:
     """The drive with steps and snippets in its gaps, and without what was measured on interpolated frames.
 
     Args:
         drive: its snippets are on usable frames; its steps over a gap are between the two ends.
         sources: sources of a snippet.
         cuts: frames that show another place than the one before: no snippet measures across them.
+        map_poses: by maps of keyframes, where steps are not measured.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
@@ -81,7 +84,7 @@ def interpolate_gaps(drive: Drive, sources: int, cuts: Collection[int] = ()) -> 
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(unusable, repeated)
     by_network = network_steps(snippets)
-    frozen, steps = _without_frozen(by_network, drive.steps, repeated, new)
+    frozen, steps = _without_frozen(by_network, drive.steps, map_poses or KeyframePoses(), repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     spans = ((s, {s.target, *s.sources}) for s in snippets)
     trusted = [s for s, span in spans if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)]
@@ -118,7 +121,11 @@ def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
 
 
 def _without_frozen(
-    by_network: Mapping[int, FloatArray], steps: StepTable, repeated: Collection[int], new: Collection[int]
+    by_network: Mapping[int, FloatArray],
+    steps: StepTable,
+    map_poses: KeyframePoses,
+    repeated: Collection[int],
+    new: Collection[int],
 ) -> tuple[set[int], StepTable]:
     """Repeated frames during which the camera moved, and the steps that remain without them.
 
@@ -136,7 +143,8 @@ def _without_frozen(
         jump = steps.motions.get((last, following))
         repeats, onward = last - first + 1, following - last
         halfway = (onward + repeats / 2) * expected
-        if jump is not None and jump.length_unscaled <= min(halfway, onward * _LONGEST_START * expected):
+        length = map_poses.length(last, following) if jump is None else jump.length_unscaled
+        if length is not None and length <= min(halfway, onward * _LONGEST_START * expected):
             continue
         frozen |= set(range(first, last + 1))
         steps = steps.without_frames(range(first, last + 1))

@@ -25,9 +25,10 @@ from slam.pipeline.pending import height_of
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
-_LAST = 4  # number of the last steps, repeated frames and unusable frames that are checked
-_DECISION_STEPS = 30  # triangulated steps after which auto decides
+_LAST = 4  # number of the last steps and unusable frames that are checked
+_CLEAR_STEPS, _MOST_STEPS = 10, 30  # triangulated steps after which auto decides, if it is clear, or however that is
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
+_CLEAR_SCATTER_DEG = 5.0  # of a camera that is carried: a vehicle's first steps scatter by 2 degrees
 _VEHICLE_SPEED = 1.5  # camera heights a second: a car at 9 km/h; a robot, a drone and a walker have less
 
 
@@ -118,13 +119,12 @@ class KeyframeTracking:
     def measures(self, drive: Drive, index: int) -> bool:
         """Whether keyframes alone measure the motion to one of the last frames.
 
-        A step measures it by a gap, a repeated image or a lost camera, and before the choice.
+        A step measures it by a gap or a lost camera, and before the choice.
         """
         if self._odometry is None or self._front_end == "both":
             return False
         by_steps = {motion.ends[1] for motion in drive.motions[-_LAST:]}
-        doubtful = {*drive.repeated[-_LAST:], *list(drive.unusable)[-_LAST:]}
-        is_doubtful = index in by_steps or not doubtful.isdisjoint((index - 1, index))
+        is_doubtful = index in by_steps or not {index - 1, index}.isdisjoint(list(drive.unusable)[-_LAST:])
         return not is_doubtful and self._odometry.locates(index - 1, index)
 
     def is_keyframe(self, index: int) -> bool:
@@ -162,17 +162,20 @@ class KeyframeTracking:
 def _is_on_vehicle(drive: Drive) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera, at the speed of a vehicle.
 
-    None while they are few. Without a road nothing has the speed of a vehicle.
+    None while they are few. Without a road nothing has the speed of a vehicle; a vehicle that starts is slow.
     """
-    first = list(islice((motion for motion in drive.motions if motion.is_triangulated), _DECISION_STEPS))
-    if len(first) < _DECISION_STEPS:
+    first = list(islice((motion for motion in drive.motions if motion.is_triangulated), _MOST_STEPS))
+    if len(first) < _CLEAR_STEPS:
         return None
     heights = [height for road in drive.roads if (height := height_of(road)) is not None]
     speeds = [motion.length_unscaled / motion.seconds for motion in first]
-    if not heights or np.median(speeds) < _VEHICLE_SPEED * np.median(heights):
-        return False
+    is_fast = bool(heights) and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
     steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])
     directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     usual = np.median(directions, axis=0)
     cosine = directions @ usual / max(float(np.linalg.norm(usual)), 1e-9)
-    return float(np.median(cosine)) > float(np.cos(np.deg2rad(_VEHICLE_SCATTER_DEG)))
+    scatter_deg = float(np.rad2deg(np.arccos(np.clip(np.median(cosine), -1.0, 1.0))))
+    is_clear = is_fast or scatter_deg > _CLEAR_SCATTER_DEG
+    if len(first) < _MOST_STEPS and not is_clear:
+        return None
+    return is_fast and scatter_deg < _VEHICLE_SCATTER_DEG

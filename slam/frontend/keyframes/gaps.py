@@ -11,7 +11,8 @@ import numpy as np
 
 from slam.frames import RelativePose, runs
 from slam.frontend.gap_interpolation import equal_step
-from slam.geometry.se3 import FloatArray, invert
+from slam.frontend.keyframes.relative_poses import chained
+from slam.geometry.se3 import invert
 
 
 def join_gap_ends(
@@ -30,7 +31,7 @@ def join_gap_ends(
         by_map: relative poses within maps.
         maps: the map of each frame that has a pose in one.
     """
-    T_map_camera = _chained(by_map)
+    T_map_camera = chained(by_map)
     loose = {pose.from_index: pose for pose in interpolated}
     T_step = {pose.from_index: pose.T_from_to for pose in measured if pose.to_index == pose.from_index + 1}
     T_step |= {first: pose.T_from_to for first, pose in loose.items()}
@@ -48,12 +49,3 @@ def join_gap_ends(
             sigmas = np.maximum(loose[k].sigmas, [0.0, 0.0, 0.0, length, length, length])
             loose[k] = replace(loose[k], T_from_to=T, sigmas=sigmas)
     return list(loose.values())
-
-
-def _chained(by_map: Sequence[RelativePose]) -> dict[int, FloatArray]:
-    """Poses in each map's first frame."""
-    T_map_camera: dict[int, FloatArray] = {}
-    for pose in sorted(by_map, key=lambda pose: pose.to_index):
-        T_map_from = T_map_camera.setdefault(pose.from_index, np.eye(4))
-        T_map_camera[pose.to_index] = T_map_from @ pose.T_from_to
-    return T_map_camera

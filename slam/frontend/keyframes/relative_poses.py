@@ -62,6 +62,18 @@ class KeyframePoses:
         after = min((frame for frame in self.segments if frame >= first), default=None)
         return before is not None and after is not None and self.segments[before] == self.segments[after]
 
+    def length(self, first: int, last: int) -> float | None:
+        """The distance of two frames in the unit of learned depth; None where no map has both."""
+        number = self.segments.get(first)
+        if number is None or number != self.segments.get(last):
+            return None
+        apart = self._T_map_camera[last][:3, 3] - self._T_map_camera[first][:3, 3]
+        return self.learned_units[number] * float(np.linalg.norm(apart))
+
+    @cached_property
+    def _T_map_camera(self) -> dict[int, FloatArray]:
+        return chained(self.poses)
+
     def frames_of(self, segment: int) -> list[int]:
         """The frames of a segment."""
         return [frame for frame, number in self.segments.items() if number == segment]
@@ -171,3 +183,12 @@ def _relative(
     floors = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3)
     own = 10.0 * floors if sigmas is None else sigmas
     return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), KEYFRAME_SOURCE)
+
+
+def chained(poses: Sequence[RelativePose]) -> dict[int, FloatArray]:
+    """Poses of the frames of some maps in each map's first frame, from poses within them."""
+    T_map_camera: dict[int, FloatArray] = {}
+    for pose in sorted(poses, key=lambda pose: pose.to_index):
+        T_map_from = T_map_camera.setdefault(pose.from_index, np.eye(4))
+        T_map_camera[pose.to_index] = T_map_from @ pose.T_from_to
+    return T_map_camera

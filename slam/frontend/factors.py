@@ -66,6 +66,16 @@ def make_factors(
     return [*by_network, *interpolated, *by_image, *by_keyframes]
 
 
+def scaled_steps(drive: Drive, scale: Scale) -> list[RelativePose]:
+    """Interpolated steps and those of image geometry in the unit of the scale, without the noise of a graph."""
+    steps = [pose.scaled(scale.unit_at(pose)) for pose in drive.gap_steps]
+    for ends, motion in drive.steps.motions.items():
+        length = scale.lengths.get(ends) if motion.is_triangulated else None
+        pose = motion.relative_pose
+        steps.append(pose.scaled(scale.unit_at(pose) if length is None else length.value / motion.length_unscaled))
+    return steps
+
+
 def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
     """The factors with LiDAR steps, all in metres, before those of image geometry, by which odometry is chained."""
     less_certain = (NETWORK_SOURCE, INTERPOLATED_SOURCE)

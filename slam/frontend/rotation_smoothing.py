@@ -66,7 +66,7 @@ def _equations(
 ) -> tuple[csr_array, FloatArray]:
     """Whitened equations of all relative rotations in the corrections of steps: matrix and right side."""
     place = {ends: 3 * n for n, ends in enumerate(motions)}
-    rows, columns, entries, target = [], [], [], []
+    rows, columns, entries, R_residual = [], [], [], []
     for n, (rotation, path) in enumerate(usable):
         R_last_step = np.eye(3)
         for ends in reversed(path):
@@ -74,10 +74,12 @@ def _equations(
             columns.append(place[ends] + _BLOCK % 3)
             entries.append((R_last_step / rotation.sigmas[:, None]).ravel())
             R_last_step = R_last_step @ _rotation(motions[ends])
-        target.append(Rotation.from_matrix(rotation.R_to_from @ R_last_step.T).as_rotvec() / rotation.sigmas)
+        R_residual.append(rotation.R_to_from @ R_last_step.T)
+    sigmas = np.array([rotation.sigmas for rotation, _ in usable])
+    target = Rotation.from_matrix(np.array(R_residual)).as_rotvec() / sigmas
     shape = 3 * len(usable), 3 * len(motions)
     A = coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
-    return A.tocsr(), np.concatenate(target)
+    return A.tocsr(), target.ravel()
 
 
 def _rotation(motion: Motion) -> FloatArray:

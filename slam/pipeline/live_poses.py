@@ -7,10 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.frontend.agreement import confidence_of_frames, frame_support
-from slam.frontend.factors import chain_odometry, make_factors
+from slam.frontend.factors import chain_odometry, scaled_steps
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale, find_scale
@@ -49,7 +48,6 @@ class LivePoses:
         sources: int,
         camera_height_m: float | None,
         config: SlamConfig,
-        noise: PoseNoise | None,
         window: int = 100,
         update: int = 10,
     ) -> None:
@@ -59,11 +57,10 @@ class LivePoses:
             sources: of a snippet.
             camera_height_m: above the road; None where unknown.
             config: of all parts.
-            noise: of the snippet poses; None measures it against image geometry alone.
             window: frames whose poses are solved again.
             update: frames between two solutions.
         """
-        self._sources, self._camera_height_m, self._config, self._noise = sources, camera_height_m, config, noise
+        self._sources, self._camera_height_m, self._config = sources, camera_height_m, config
         self._mode = resolve_mode(config.scale, camera_height_m)
         self._window, self._update = window, update
         self.unit_name: str | None = None  # of all lengths, None while unknown
@@ -143,8 +140,6 @@ class LivePoses:
             return
         config, window = self._config, complete_drive(window, self._sources)
         scale = find_scale(self._mode, self._camera_height_m, window, [], config.lengths)
-        factors = make_factors(window, scale, self._noise, config.pose_network, config.visual_odometry)
-        T_odometry = chain_odometry(factors, chain_raw(window.snippets, len(window)), scale)
         self.unit_name = scale.unit_name
         by_keyframes = observer.keyframe_step(count - 1) is not None
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
@@ -154,6 +149,8 @@ class LivePoses:
         self._unit = unit
         if by_keyframes:
             return
+        steps, T_network = scaled_steps(window, scale), chain_raw(window.snippets, len(window))
+        T_odometry = chain_odometry(steps, T_network, scale)
         kept = max(first, self._settled)
         T_window_camera = T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])

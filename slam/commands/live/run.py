@@ -82,7 +82,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     require_possible(growing, settings, predictor.sources + 1)
     sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
-    poses = LivePoses(predictor.sources, sequence.camera_height_m, settings, networks.noise)
+    poses = LivePoses(predictor.sources, sequence.camera_height_m, settings)
     session = _Session(sequence, poses, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
         dataset=Path(request.source),

@@ -36,8 +36,8 @@ _ALIGNED_KEYFRAMES = 4
 _ATTEMPTS, _MISSES = 2, 3
 _LEAST_FOUND = 0.02
 # most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
-# ten times; but in a young map, depth and motion change together for long at hardly any cost
-_LIMITS, _YOUNG_LIMITS = (6, 3e-3), (60, 1e-6)
+# ten times; but in a young map, depth and motion change together at hardly any cost
+_LIMITS, _YOUNG_LIMITS = (6, 3e-3), (12, 1e-3)
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted

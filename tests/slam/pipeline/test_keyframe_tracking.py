@@ -62,9 +62,12 @@ KEYFRAMES_ALONE = SlamConfig(
 )
 
 
-def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
-    """Before their map begins and over a gap, but not beside repeated images."""
+@pytest.mark.parametrize("stands", [False, True])
+def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
+    """Before their map begins and over a gap, but not beside repeated images: the map tells whether the camera stood."""
     truth, blank, repeated = room.walk(40), (24, 25), (32, 33)
+    if stands:
+        truth[34:] = truth[32:38]
     truth[[*repeated]] = truth[31]
     oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
@@ -76,7 +79,7 @@ def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
     assert started < 10 and len(closed.map_poses.segments) == 40 - len(blank) - started
     late = [motion.ends for motion in observer.drive.motions if motion.ends[0] > 19]
     assert late == [(23, 26)]
-    assert set(closed.interpolated) == {*blank, *repeated}
+    assert set(closed.interpolated) == {*blank, *(() if stands else repeated)}
 
 
 @pytest.mark.parametrize("interrupted", [(), (19, 21), (20, 22)])

@@ -64,12 +64,12 @@ KEYFRAMES_ALONE = SlamConfig(
 
 @pytest.mark.parametrize("stands", [False, True])
 def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
-    """Before their map begins and over a gap, but not beside repeated images: the map tells whether the camera stood."""
+    """Before their map begins and over a gap, not beside repeated images: the map tells whether the camera stood."""
     truth, blank, repeated = room.walk(40), (24, 25), (32, 33)
     if stands:
         truth[34:] = truth[32:38]
     truth[[*repeated]] = truth[31]
-    oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
+    oracle = OraclePredictor(truth, lambda k: 0.5 * room.depth_map(truth[k]))  # in the unit of its poses
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k, T in enumerate(truth):
             frame = room.frame(k, T)

@@ -127,7 +127,7 @@ class TsdfMap:
             SlamError: a submap cannot be written, or the disk is full.
         """
         self._fuse_waiting(None)
-        if self._left_out and not self._fused:
+        if self._left_out and self._previous is None:
             raise EmptyMapError(
                 f"the map is empty: none of {self._left_out} keyframes has depth that is certain to "
                 f"mapping.max_relative_sigma={self._config.max_relative_sigma:g}; more fuses what networks guess"

@@ -59,7 +59,7 @@ def make_factors(
         return [pose for pose in poses if not maps.is_inside(pose)]
 
     by_network, interpolated = (
-        [pose.scaled(scale.unit_at(pose)) for pose in outside(poses)] for poses in (networks, drive.gap_steps)
+        [scale.scaled(pose) for pose in outside(poses)] for poses in (networks, drive.gap_steps)
     )
     by_image, by_keyframes = outside(geometric), scaled_poses(maps.poses, maps, scale)
     interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
@@ -68,11 +68,10 @@ def make_factors(
 
 def scaled_steps(drive: Drive, scale: Scale) -> list[RelativePose]:
     """Interpolated steps and those of image geometry in the unit of the scale, without the noise of a graph."""
-    steps = [pose.scaled(scale.unit_at(pose)) for pose in drive.gap_steps]
+    steps = [scale.scaled(pose) for pose in drive.gap_steps]
     for ends, motion in drive.steps.motions.items():
-        length = scale.lengths.get(ends) if motion.is_triangulated else None
-        pose = motion.relative_pose
-        steps.append(pose.scaled(scale.unit_at(pose) if length is None else length.value / motion.length_unscaled))
+        length, pose = scale.lengths.get(ends) if motion.is_triangulated else None, motion.relative_pose
+        steps.append(scale.scaled(pose) if length is None else pose.scaled(length.value / motion.length_unscaled))
     return steps
 
 
@@ -136,7 +135,7 @@ def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> 
     for ends, motion in steps.motions.items():
         length = scale.lengths.get(ends)
         if not motion.is_triangulated or length is None:
-            factors.append(motion.relative_pose.scaled(scale.unit_at(motion.relative_pose)))
+            factors.append(scale.scaled(motion.relative_pose))
             continue
         pose = motion.with_length(length.value, length.relative_sigma, length.relative_correlated_sigma, noise[ends])
         factors.append(replace(pose, student_t_dof=STUDENT_T_DOF))

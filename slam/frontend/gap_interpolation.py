@@ -29,13 +29,14 @@ _LONGEST_DOUBT = 2
 _SIGMA_FLOOR = 1e-6
 _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
 _TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
+_NO_MAPS = KeyframePoses()
 
 
 def complete_drive(
     drive: Drive,
     sources: int,
     maps: Sequence[MapSegment] = (),
-    map_poses: KeyframePoses | None = None,
+    map_poses: KeyframePoses = _NO_MAPS,
     events: Sequence[TrackingEvent] = (),
 ) -> Drive:
     """The drive with its gaps interpolated, its rotations smoothed, and its segments; more frames may follow.
@@ -50,7 +51,6 @@ def complete_drive(
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
-    map_poses = map_poses or KeyframePoses()
     measured = {*drive.steps.motions, *map_poses.steps}
     cuts = find_cuts(drive.failures, measured, {*drive.unusable, *drive.repeated})
     filled = interpolate_gaps(drive, sources, cuts, map_poses)
@@ -65,7 +65,7 @@ def complete_drive(
 
 
 def interpolate_gaps(
-    drive: Drive, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses | None = None
+    drive: Drive, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses = _NO_MAPS
 ) -> Drive:
     """The drive with steps and snippets in its gaps, and without what was measured on interpolated frames.
 
@@ -84,7 +84,7 @@ def interpolate_gaps(
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(unusable, repeated)
     by_network = network_steps(snippets)
-    frozen, steps = _without_frozen(by_network, drive.steps, map_poses or KeyframePoses(), repeated, new)
+    frozen, steps = _without_frozen(by_network, drive.steps, map_poses, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     spans = ((s, {s.target, *s.sources}) for s in snippets)
     trusted = [s for s, span in spans if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)]

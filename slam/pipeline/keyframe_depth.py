@@ -49,7 +49,7 @@ class KeyframeDepths:
         self._keyframes: Sequence[Keyframe] = drive.keyframes
         self._roads = drive.roads
         self._scale, self._T_world_camera, self._error = scale_per_frame, T_world_camera, error
-        self._guess_sigma = guess_sigma
+        self._guess_sigma = None if decide is None else guess_sigma
         self._refiner: DepthRefiner | None = None
         if decide is not None:
             indices = [keyframe.index for keyframe in self._keyframes]
@@ -80,7 +80,6 @@ class KeyframeDepths:
             refined = self._refiner.refine(n, unbiased, road)
         image, pose = keyframe.image, self._T_world_camera[keyframe.index]
         if refined is None:
-            is_guess = self._refiner is not None and self._guess_sigma is not None
-            sigma = np.full_like(unbiased, self._guess_sigma) if is_guess else None
+            sigma = None if self._guess_sigma is None else np.full_like(unbiased, self._guess_sigma)
             return KeyframeDepth(keyframe.index, unbiased, sigma, image, pose, depth)
         return KeyframeDepth(keyframe.index, refined.depth, refined.relative_sigma, image, pose, depth)

@@ -79,6 +79,10 @@ class Scale:
         """The mode's unit per unscaled length at the first frame of a measurement."""
         return float(self.per_frame[min(measured.ends)])
 
+    def scaled(self, measured: RelativePose) -> RelativePose:
+        """An unscaled measurement in the mode's unit."""
+        return measured.scaled(self.unit_at(measured))
+
 
 def find_scale(
     mode: ScaleMode,

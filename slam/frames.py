@@ -87,6 +87,10 @@ class Frame:
         known: T = self._derived[key]
         return known
 
+    def known(self, key: Hashable) -> Any:
+        """What was derived with this key before, or None."""
+        return self._derived.get(key)
+
     @property
     def grey(self) -> Grey:
         """Grey levels ``(H, W)`` uint8."""

@@ -41,6 +41,8 @@ def consensus(
 ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]] | None:
     """Rotation vector ``(3,)``, translation ``(3,)`` and inlier rows with most support, or None.
 
+    Samples of three points, each good one refined on its inliers (OpenCV's USAC).
+
     Args:
         points: ``(M, 3)``.
         pixels: their projections ``(M, 2)``, in the unit of K.
@@ -50,14 +52,12 @@ def consensus(
         seed: other seeds draw other samples.
     """
     order = ransac_order(len(points), seed)
-    found, rotation, translation, chosen = cv2.solvePnPRansac(
-        points[order],
-        pixels[order],
-        K,
-        None,
-        iterationsCount=iterations,
-        reprojectionError=reprojection_px,
-        confidence=_CONFIDENCE,
+    params = cv2.UsacParams()
+    params.maxIterations, params.threshold, params.confidence = iterations, reprojection_px, _CONFIDENCE
+    params.sampler, params.score = cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC
+    params.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    found, _, rotation, translation, chosen = cv2.solvePnPRansac(
+        points[order], pixels[order], K.copy(), None, params=params
     )
     if not found or chosen is None:
         return None

@@ -45,7 +45,7 @@ class Observer:
     result is collected with the next frame, so results do not depend on the timing of threads.
 
     With ``depth.frame_stride`` above 1, depth is carried to the frames between by the measured motion, and snippets
-    touch. While keyframes alone measure the camera, depth is predicted for them and for the targets of snippets.
+    touch. While keyframes alone measure the camera, depth is predicted for them alone.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Observer:
         by_keyframes, step = self._keyframes.measures(self._drive, index - 2), last_step(self._drive, index - 2)
         is_dense = not by_keyframes and (step is None or stride == 1)
         far = step is not None and has_moved_on(self._drive, step, index + 1 - self._depth_index)
-        is_seen = (index + sources // 2) % sources == 0 if by_keyframes else step is None or far or index % stride == 0
+        is_seen = not by_keyframes and (step is None or far or index % stride == 0)
         depth = snippet = None
         if is_seen or self._drive.repeated[-1:] == [index - 1]:  # what a frozen image hid is not carried
             self._depth_index = index

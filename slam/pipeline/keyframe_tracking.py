@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Literal
 
@@ -62,13 +62,20 @@ class KeyframeTracking:
         seed: int,
         state: KeyframeOdometryState | None,
         camera_height_m: float | None = None,
+        on_keyframe: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
-        """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone."""
+        """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone.
+
+        ``on_keyframe`` is told of a keyframe before it is adjusted.
+        """
         self._config, self._loops, self._intrinsics, self._seed = config, loops, intrinsics, seed
         self._camera_height_m = camera_height_m
         self._places: Relocaliser | None = None
         self._front_end: FrontEnd = "steps" if state is None else "both"
-        self._odometry = None if state is None else KeyframeOdometry(config, intrinsics, seed, state)
+        if state is None:
+            self._odometry = None
+        else:
+            self._odometry = KeyframeOdometry(config, intrinsics, seed, state, on_keyframe)
 
     def state(self) -> KeyframeOdometryState | None:
         """The state to resume from."""
@@ -126,10 +133,6 @@ class KeyframeTracking:
         by_steps = {motion.ends[1] for motion in drive.motions[-_LAST:]}
         is_doubtful = index in by_steps or not {index - 1, index}.isdisjoint(list(drive.unusable)[-_LAST:])
         return not is_doubtful and self._odometry.locates(index - 1, index)
-
-    def is_keyframe(self, index: int) -> bool:
-        """Whether the last frame is a keyframe."""
-        return self._odometry is not None and self._odometry.is_keyframe(index)
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Any, Self
@@ -71,6 +71,7 @@ class Observer:
         """
         self._predictor = predictor
         self._config, self._intrinsics, self._seed = config, intrinsics, seed
+        self._baseline = config.visual_odometry.rotation_baseline_steps
         self._stopwatch = stopwatch
         self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate)
@@ -78,7 +79,8 @@ class Observer:
             config.visual_odometry, intrinsics, seed, None if state is None else state.odometry
         )
         keyframes = KeyframeOdometryState() if state is None else state.keyframes
-        self._keyframes = KeyframeTracking(config.keyframes, config.loops, intrinsics, seed, keyframes, camera_height_m)
+        parts = config.keyframes, config.loops, intrinsics, seed, keyframes, camera_height_m
+        self._keyframes = KeyframeTracking(*parts, self._predict_depth)
         self._keyframes.choose(self._drive)
         self._road = RoadHomography(config.road, intrinsics, () if state is None else state.road_directions)
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
@@ -91,6 +93,7 @@ class Observer:
         self._networks = predictor.executor()
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="beside")
         self._pending: PendingFrame | None = None
+        self._depth: Future[DepthMap] | None = None  # of the frame that is processed
         self._tasks: list[PendingTask] = []
 
     def __enter__(self) -> Self:
@@ -222,7 +225,7 @@ class Observer:
             raise
 
     def _process(self, pending: PendingFrame) -> None:
-        frame = pending.frame
+        frame, self._depth = pending.frame, pending.depth
         self._finish_tasks("depth network")  # of a keyframe, whose points depend on it
         with self._stopwatch.stage("keyframes"):
             self._keyframes.follow(frame)
@@ -239,16 +242,17 @@ class Observer:
         if self._config.road.enabled and step is not None:
             self._tasks.append(self._road_task(self._recent[-1].frame, pending, step))
         self._drive.roads.append(MeasurementFailure("its depth was not predicted"))
-        self._recent = (*self._recent, RecentFrame(frame, None, None))[
-            -self._config.visual_odometry.rotation_baseline_steps :
-        ]
+        self._recent = (*self._recent, RecentFrame(frame, None, None))[-self._baseline :]
         if pending.depth is not None:
             with self._stopwatch.stage("depth network"):
                 depth = pending.depth.result()
             self._learn(pending, depth)
-        elif self._keyframes.is_keyframe(frame.index):
-            late = self._networks.submit(predicted_depth, self._predictor, frame)
-            self._tasks.append(PendingTask("depth network", late, partial(self._learn, pending)))
+        elif self._depth is not None:  # of a keyframe
+            self._tasks.append(PendingTask("depth network", self._depth, partial(self._learn, pending)))
+
+    def _predict_depth(self, keyframe: Frame) -> None:
+        """Predict the depth of a keyframe while it is adjusted, unless it was asked for before."""
+        self._depth = self._depth or self._networks.submit(predicted_depth, self._predictor, keyframe)
 
     def _learn(self, pending: PendingFrame, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
@@ -305,13 +309,12 @@ class Observer:
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
         """Prepare to measure the rotation across the last steps, if all of them were triangulated."""
-        baseline = self._config.visual_odometry.rotation_baseline_steps
-        if baseline < 2 or len(self._recent) < baseline:
+        if self._baseline < 2 or len(self._recent) < self._baseline:
             return None
-        first = self._recent[-baseline]
-        motions = {m.ends: m for m in self._drive.motions[-2 * baseline :] if m.is_triangulated}
+        first = self._recent[-self._baseline]
+        motions = {m.ends: m for m in self._drive.motions[-2 * self._baseline :] if m.is_triangulated}
         path = path_between(shortest_by_start(motions), first.frame.index, current.index)
-        if path is None or len(path) != baseline:
+        if path is None or len(path) != self._baseline:
             return None
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
         return self._odometry.relative_rotation(first.frame, current, self._known(first)[0], T_first_current)

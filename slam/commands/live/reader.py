@@ -1,8 +1,9 @@
-"""Frames of a source in a thread of their own; only the newest waits, so that nothing falls behind."""
+"""Frames of a source in a thread of their own; they wait for a moment at most, so that nothing falls behind."""
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from threading import Condition, Event, Thread
@@ -14,6 +15,7 @@ from slam.runtime.errors import SequenceError
 INTERRUPTED, OVER = "it was interrupted", "the source ended"
 EXPECTED = (INTERRUPTED, OVER)
 _LAST_IMAGE_S = 2.0
+_MOST_LATE_S = 0.15  # an image that waits is dropped for one that was taken later than this: a keyframe takes as long
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Reader:
     """Iterates over the arrivals that were not dropped.
 
     Attributes:
-        dropped: number of images replaced by a newer one before they were taken.
+        dropped: number of images that waited, and were too old when another one came.
         ended: why there are no more, after the last one.
     """
 
@@ -47,7 +49,7 @@ class Reader:
         self.dropped, self.ended = 0, ""
         self._source, self._most_wait_s, self._prepare = source, most_wait_s, prepare
         self._every_frame = every_frame
-        self._newest: Arrival | None = None
+        self._waiting: deque[Arrival] = deque()
         self._reason: str | None = None
         self._changed, self._stopped = Condition(), Event()
         self._thread = Thread(target=self._read, name="reader", daemon=True)
@@ -60,10 +62,10 @@ class Reader:
     @property
     def is_waiting(self) -> bool:
         """Whether an image waits to be taken."""
-        return self._newest is not None
+        return bool(self._waiting)
 
     def stop(self) -> None:
-        """End after the image that waits."""
+        """End after the images that wait."""
         self._stopped.set()
         self._end(INTERRUPTED)
 
@@ -74,8 +76,8 @@ class Reader:
 
     def _take(self) -> Arrival | None:
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None or self._reason is not None, self._most_wait_s)
-            arrival, self._newest = self._newest, None
+            self._changed.wait_for(lambda: self._waiting or self._reason is not None, self._most_wait_s)
+            arrival = self._waiting.popleft() if self._waiting else None
             self._changed.notify()
             if arrival is None:
                 self.ended = self._reason or f"nothing came for {self._most_wait_s:g} s"
@@ -87,11 +89,13 @@ class Reader:
             for stamp, image in self._source.images(self._stopped):
                 with self._changed:
                     if self._every_frame:
-                        self._changed.wait_for(lambda: self._newest is None or self._stopped.is_set())
+                        self._changed.wait_for(lambda: not self._waiting or self._stopped.is_set())
                     if self._stopped.is_set():
                         return
-                    self.dropped += self._newest is not None
-                    self._newest = Arrival(stamp, image, time.monotonic())
+                    while self._waiting and stamp - self._waiting[0].stamp > _MOST_LATE_S:
+                        self._waiting.popleft()
+                        self.dropped += 1
+                    self._waiting.append(Arrival(stamp, image, time.monotonic()))
                     self._changed.notify()
             self._end(OVER)
         except SequenceError as error:

@@ -8,7 +8,7 @@ not drift, so each corner is compared with its image in the keyframe, not with t
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -72,12 +72,21 @@ class KeyframeOdometry:
     """Poses of the frames of one sequence in the unit of each segment's map."""
 
     def __init__(
-        self, config: KeyframesConfig, intrinsics: Intrinsics, seed: int = 0, state: KeyframeOdometryState | None = None
+        self,
+        config: KeyframesConfig,
+        intrinsics: Intrinsics,
+        seed: int = 0,
+        state: KeyframeOdometryState | None = None,
+        on_keyframe: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
-        """Prepare for the first frame, or resume from a ``state``; ``seed`` is that of RANSAC."""
+        """Prepare for the first frame, or resume from a ``state``; ``seed`` is that of RANSAC.
+
+        ``on_keyframe`` is told of a keyframe before it is adjusted, so that its depth is predicted meanwhile.
+        """
         self._config = config
         self._intrinsics = intrinsics
         self._seed = seed
+        self._on_keyframe = on_keyframe
         self._state = KeyframeOdometryState() if state is None else state.copy()
         self._spread: FloatArray | None = None  # of the points of the last keyframe, once they are looked for
 
@@ -179,10 +188,6 @@ class KeyframeOdometry:
             for before in self._state.segments[:-1]:
                 before.map.forget_images()
             self._note(frame.index, "map begun", support=points)
-
-    def is_keyframe(self, index: int) -> bool:
-        """Whether that frame is the last keyframe."""
-        return self._state.segments[-1].map.keyframes[-1].index == index
 
     def locates(self, first: int, last: int) -> bool:
         """Whether two of the last frames both have a pose in the newest map."""
@@ -290,6 +295,7 @@ class KeyframeOdometry:
 
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""
+        self._on_keyframe(frame)
         state, config, intrinsics, local = self._state, self._config, self._intrinsics, segment.map
         T, is_tracked = state.T_camera_world, len(track_ids) > 0
         if is_tracked:

@@ -241,7 +241,7 @@ class Scripted:
 
 
 def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
-    """While we are busy with the first of 51 images, all others come."""
+    """While we are busy with the first of 51 images, all others come; the last two of them wait."""
     first_is_taken = Event()
     source = Scripted(51, lambda number: number and first_is_taken.wait())
     reader, taken = Reader(source, 60.0, lambda image: image), []
@@ -249,7 +249,7 @@ def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
         taken.append(int(arrival.image[0, 0, 0]))
         first_is_taken.set()
         source.is_over.wait()
-    assert taken == [0, 50] and reader.dropped == 49 and reader.ended == "the source ended"
+    assert taken == [0, 49, 50] and reader.dropped == 48 and reader.ended == "the source ended"
 
 
 def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:

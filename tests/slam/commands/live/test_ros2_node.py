@@ -222,12 +222,12 @@ def matrix(node_module: ModuleType, message: Any) -> FloatArray:
 
 
 def test_loops_move_the_map_and_not_the_odometry(
-    node_module: ModuleType, kitti_root: Path, tiny_weights: Path, monkeypatch: pytest.MonkeyPatch
+    node_module: ModuleType, kitti_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive = open_sequence(kitti_root)
     intrinsics = drive.intrinsics
     of_base = {"base_frame": "base_link", "map_every": 12, "keyframe_spacing": 0.5, "depth_to": 30}
-    asked = {"weights": str(tiny_weights), "camera_height_m": 1.65, **of_base}
+    asked = {"weights": "sim", "camera_height_m": 1.65, **of_base}
     monkeypatch.setattr(RecordedNode, "parameters", asked)
     T_base_camera = node_module.T_MAP_WORLD.copy()
     T_base_camera[:3, 3] = 0.2, 0.0, 1.65

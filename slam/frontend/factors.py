@@ -25,7 +25,7 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.geometry.se3 import FloatArray, invert, nearest_rotation
+from slam.geometry.se3 import FloatArray, invert, rigid
 
 
 def make_factors(
@@ -115,12 +115,12 @@ def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale
             arriving[last] = factor
     increments = invert(T_network[:-1]) @ T_network[1:]
     increments[:, :3, 3] *= scale.per_frame[:-1, None]
+    before = np.arange(len(increments))
+    for k, step in arriving.items():
+        before[k - 1], increments[k - 1] = step.from_index, step.T_from_to
     T_world_camera = np.tile(np.eye(4), (len(T_network), 1, 1))
-    for k in range(1, len(T_network)):
-        step = arriving.get(k)
-        first, T_first_camera = (k - 1, increments[k - 1]) if step is None else (step.from_index, step.T_from_to)
-        T_world_camera[k] = T_world_camera[first] @ T_first_camera
-        T_world_camera[k, :3, :3] = nearest_rotation(T_world_camera[k, :3, :3])
+    for k, (first, T_first_camera) in enumerate(zip(before.tolist(), rigid(increments), strict=True), start=1):
+        np.matmul(T_world_camera[first], T_first_camera, out=T_world_camera[k])
     return T_world_camera
 
 

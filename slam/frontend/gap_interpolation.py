@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from erfsfm.pose_noise import tangent
 from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.map_segment import MapSegment
@@ -17,7 +17,7 @@ from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.segments import find_cuts, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
-from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
 from slam.runtime.errors import SlamError
 
 INTERPOLATED_SOURCE = "interpolated"
@@ -156,21 +156,20 @@ def _without_frozen(
 
 def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[int, FloatArray]:
     """Motions of all steps: unknown ones are interpolated from the mean motion before them to that after them."""
+    unknown = [step for step in steps if step not in known]
+    if not unknown:
+        return dict(known)
     numbers = np.array(sorted(known))
-    complete = dict(known)
-    for step in steps:
-        if step in known:
-            continue
-        before, after = numbers[numbers < step], numbers[numbers > step]
-        tangents, distances = [], []
-        for near in (before[::-1][:_STEPS_OF_A_MOTION], after[:_STEPS_OF_A_MOTION]):
-            if len(near):
-                tangents.append(np.mean([_tangent(known[k]) for k in near], axis=0))
-                distances.append(abs(int(near[0]) - step))
-        weights = np.array(distances[::-1], dtype=np.float64)
-        rotation_vector, translation = np.split(weights @ np.array(tangents) / weights.sum(), 2)
-        complete[step] = from_rotation_vector(rotation_vector, translation)
-    return complete
+    motion = tangent(np.array([known[k] for k in numbers.tolist()]))
+    found = np.empty((len(unknown), 6))
+    for row, step in enumerate(unknown):
+        after = int(np.searchsorted(numbers, step))
+        around = slice(max(after - _STEPS_OF_A_MOTION, 0), after), slice(after, after + _STEPS_OF_A_MOTION)
+        ends = [(numbers[part], motion[part].mean(axis=0)) for part in around if len(numbers[part])]
+        distances = np.array([np.abs(near - step).min() for near, _ in ends], np.float64)[::-1]
+        found[row] = distances @ np.array([mean for _, mean in ends]) / distances.sum()
+    T = from_rotation_vector(found[:, :3], found[:, 3:])
+    return {**known, **dict(zip(unknown, T, strict=True))}
 
 
 def _equal_steps(geometric: Sequence[RelativePose], loose: set[int]) -> dict[int, FloatArray]:
@@ -196,30 +195,19 @@ def _filled(
 ) -> list[SnippetPoses]:
     """One snippet a target; missing ones are chained from single steps."""
     by_target = {snippet.target: snippet for snippet in snippets}
+    T_first_camera = chain(np.array([steps[k] for k in range(count - 1)]))
     filled, half = [], sources // 2
     for target in range(half, count - sources + half):
         snippet = by_target.get(target)
         if snippet is None:
-            around = tuple(k for k in range(target - half, target - half + sources + 1) if k != target)
-            T_source_target = np.stack([_between(steps, source, target) for source in around])
-            snippet = SnippetPoses(target, around, T_source_target)
+            around = [k for k in range(target - half, target - half + sources + 1) if k != target]
+            T_source_target = invert(T_first_camera[around]) @ T_first_camera[target]
+            snippet = SnippetPoses(target, tuple(around), T_source_target)
         filled.append(snippet)
     return filled
-
-
-def _between(steps: Mapping[int, FloatArray], a: int, b: int) -> FloatArray:
-    """``T_a_b`` from ``T_k_next``."""
-    if a > b:
-        return invert(_between(steps, b, a))
-    return reduce(np.matmul, (steps[k] for k in range(a, b)), np.eye(4))
 
 
 def _interpolated_step(step: int, T_from_to: FloatArray, typical: float) -> RelativePose:
     length = max(float(np.linalg.norm(T_from_to[:3, 3])), typical, _SIGMA_FLOOR)
     rotation, translation = np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length
     return RelativePose(step, step + 1, T_from_to, np.repeat([rotation, translation], 3), INTERPOLATED_SOURCE)
-
-
-def _tangent(T_a_b: FloatArray) -> FloatArray:
-    """Rotation vector and translation ``(6,)``."""
-    return np.concatenate([Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec(), T_a_b[:3, 3]])

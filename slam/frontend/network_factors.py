@@ -28,7 +28,7 @@ from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.step_table import path_between, shortest_by_start
 from slam.geometry.robust import mad_sigma, mad_sigmas
-from slam.geometry.se3 import FloatArray, invert, nearest_rotation
+from slam.geometry.se3 import FloatArray, chain, invert, nearest_rotation
 from slam.runtime.errors import SlamError
 
 NETWORK_SOURCE = "network"
@@ -239,10 +239,8 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     first, last = snippets[0], snippets[-1]
     T_first_camera = np.tile(np.eye(4), (count, 1, 1))  # in the camera of the first target until the end
     T_first_camera[: first.target] = [first.T_target_camera[k] for k in range(first.target)] or np.zeros((0, 4, 4))
-    for snippet in snippets[:-1]:
-        T_next = T_first_camera[snippet.target] @ snippet.T_target_camera[snippet.target + 1]
-        T_next[:3, :3] = nearest_rotation(T_next[:3, :3])
-        T_first_camera[snippet.target + 1] = T_next
+    increments = [snippet.T_target_camera[snippet.target + 1] for snippet in snippets[:-1]]
+    T_first_camera[first.target : last.target + 1] = chain(np.array(increments).reshape(-1, 4, 4))
     for k in range(last.target + 1, count):
         T_first_camera[k] = T_first_camera[last.target] @ last.T_target_camera[k]
     T_world_camera: FloatArray = invert(T_first_camera[0]) @ T_first_camera

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends
 from slam.frontend.step_table import StepTable, path_between, shortest_by_start
-from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.geometry.se3 import FloatArray, invert
 
@@ -43,7 +42,9 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
     usable = [(rotation, path) for rotation, path in paths if path]
     if not usable:
         return table
-    A, target = _equations(motions, usable)
+    T_current_previous = invert(np.array([motion.relative_pose.T_from_to for motion in motions.values()]))
+    R_current_previous = dict(zip(motions, T_current_previous[:, :3, :3], strict=True))
+    A, target = _equations(R_current_previous, usable)
     # relative rotations that overlap share their images: overlapping ones count as one
     overlapping = max(len(path) for _, path in usable)
     sigmas = np.concatenate([motion.relative_pose.sigmas[:3] for motion in motions.values()])
@@ -55,17 +56,18 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
         weights = np.repeat(1.0 / (1.0 + (residual / _OUTLIER_SIGMAS) ** 2), 3) / overlapping
         weighted = A.multiply(weights[:, None]).T.tocsr()
         correction = np.atleast_1d(spsolve((weighted @ A + prior).tocsc(), weighted @ target))
-    small = Rotation.from_rotvec(correction.reshape(-1, 3)).as_matrix()
-    return table.replaced(
-        {ends: motion.with_rotation(R @ _rotation(motion)) for R, (ends, motion) in zip(small, motions.items())}
+    T_current_previous[:, :3, :3] = (
+        Rotation.from_rotvec(correction.reshape(-1, 3)).as_matrix() @ T_current_previous[:, :3, :3]
     )
+    smoothed = zip(motions.items(), invert(T_current_previous), strict=True)
+    return table.replaced({ends: motion.with_pose(T) for (ends, motion), T in smoothed})
 
 
 def _equations(
-    motions: Mapping[Ends, Motion], usable: Sequence[tuple[RelativeRotation, list[Ends]]]
+    R_current_previous: Mapping[Ends, FloatArray], usable: Sequence[tuple[RelativeRotation, list[Ends]]]
 ) -> tuple[csr_array, FloatArray]:
     """Whitened equations of all relative rotations in the corrections of steps: matrix and right side."""
-    place = {ends: 3 * n for n, ends in enumerate(motions)}
+    place = {ends: 3 * n for n, ends in enumerate(R_current_previous)}
     rows, columns, entries, R_residual = [], [], [], []
     for n, (rotation, path) in enumerate(usable):
         R_last_step = np.eye(3)
@@ -73,16 +75,10 @@ def _equations(
             rows.append(3 * n + _BLOCK // 3)
             columns.append(place[ends] + _BLOCK % 3)
             entries.append((R_last_step / rotation.sigmas[:, None]).ravel())
-            R_last_step = R_last_step @ _rotation(motions[ends])
+            R_last_step = R_last_step @ R_current_previous[ends]
         R_residual.append(rotation.R_to_from @ R_last_step.T)
     sigmas = np.array([rotation.sigmas for rotation, _ in usable])
     target = Rotation.from_matrix(np.array(R_residual)).as_rotvec() / sigmas
-    shape = 3 * len(usable), 3 * len(motions)
+    shape = 3 * len(usable), 3 * len(place)
     A = coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
     return A.tocsr(), target.ravel()
-
-
-def _rotation(motion: Motion) -> FloatArray:
-    """``R_current_previous`` of a step."""
-    R: FloatArray = invert(motion.relative_pose.T_from_to)[:3, :3]
-    return R

@@ -59,9 +59,8 @@ def rotation_angle(R: FloatArray) -> FloatArray:
 def chain(T_previous_next: FloatArray) -> FloatArray:
     """Poses ``(N + 1, 4, 4)`` in the first frame from N increments ``T_previous_next`` ``(N, 4, 4)``."""
     T_first_k = np.tile(np.eye(4), (len(T_previous_next) + 1, 1, 1))
-    for k, increment in enumerate(T_previous_next):
-        T_first_k[k + 1] = T_first_k[k] @ increment
-        T_first_k[k + 1, :3, :3] = nearest_rotation(T_first_k[k + 1, :3, :3])
+    for k, increment in enumerate(rigid(T_previous_next)):
+        np.matmul(T_first_k[k], increment, out=T_first_k[k + 1])
     return T_first_k
 
 
@@ -77,6 +76,11 @@ def nearest_rotation(M: FloatArray) -> FloatArray:
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     R: FloatArray = U @ Vt
     return R
+
+
+def rigid(T_a_b: FloatArray) -> FloatArray:
+    """Transforms ``(..., 4, 4)`` with the rotations closest to theirs: those of networks have seven digits."""
+    return make(nearest_rotation(T_a_b[..., :3, :3]), T_a_b[..., :3, 3])
 
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -138,10 +138,12 @@ class LivePoses:
         window = observer.drive.since(first)
         if not window.snippets:
             return
-        config, window = self._config, complete_drive(window, self._sources)
-        scale = find_scale(self._mode, self._camera_height_m, window, [], config.lengths)
-        self.unit_name = scale.unit_name
         by_keyframes = observer.keyframe_step(count - 1) is not None
+        # keyframes know all lengths but their unit, which learned depth of the ground gives
+        roads_alone = replace(window, motions=[], road_steps={})
+        window = roads_alone if by_keyframes else complete_drive(window, self._sources)
+        scale = find_scale(self._mode, self._camera_height_m, window, [], self._config.lengths)
+        self.unit_name = scale.unit_name
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
         if self._unit is None:
             for T in (*self._T_world_camera, self._T_previous_newest):

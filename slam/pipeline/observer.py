@@ -199,11 +199,11 @@ class Observer:
         by_keyframes, step = self._keyframes.measures(self._drive, index - 2), last_step(self._drive, index - 2)
         is_dense = not by_keyframes and (step is None or stride == 1)
         far = step is not None and has_moved_on(self._drive, step, index + 1 - self._depth_index)
-        is_seen = not by_keyframes and (step is None or far or index % stride == 0)
+        after_frozen = self._drive.repeated[-1:] == [index - 1]  # what it hid is not carried
+        is_seen = not by_keyframes and (step is None or far or index % stride == 0 or after_frozen)
         depth = snippet = None
-        if is_seen or self._drive.repeated[-1:] == [index - 1]:  # what a frozen image hid is not carried
-            self._depth_index = index
-            depth = self._networks.submit(predicted_depth, self._predictor, frame)
+        if is_seen:
+            self._depth_index, depth = index, self._networks.submit(predicted_depth, self._predictor, frame)
         if len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0):
             snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
         return PendingFrame(frame, depth, snippet, self._gate.state().standing)

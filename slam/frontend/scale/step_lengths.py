@@ -8,7 +8,7 @@ the lengths ``x`` and the unit's deviation ``b``, with ``t`` the duration of a s
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
     x_k - x_{k-1} = log(t_k / t_{k-1})
 
-solved for the whole drive by robust sparse least squares (``docs/design/scale-and-lengths.md``).
+solved for the whole drive by robust least squares, whose matrix is banded (``docs/design/scale-and-lengths.md``).
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, csr_array
-from scipy.sparse.linalg import spsolve
+from scipy.linalg import solveh_banded
 
 from slam.config.sections import LengthConfig
 from slam.frames import Ends
@@ -128,7 +127,7 @@ def gather_evidence(
 def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
     """Robust least squares on all evidence: Huber weights first, then Cauchy weights against outliers."""
     steps = len(evidence.learned)
-    lengths, units = np.arange(steps), steps + np.arange(steps)
+    lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, config.ratio_sigma)
     learned_sigma = config.learned_sigma * np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
@@ -141,55 +140,65 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         # one prior on the unit of the whole drive, divided among its steps
         _Rows(units, None, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
     ]
-    A, target = _whitened(rows, 2 * steps)
-    measured = np.zeros(steps, dtype=bool)
+    measured = np.zeros(2 * steps, dtype=bool)
     for row in rows[:3]:
         measured[row.plus[np.isfinite(row.value)]] = True
-    idle = csr_array((np.where(np.concatenate([measured, ones > 0]), 0.0, 1.0), (range(2 * steps),) * 2))
-    state, weights = np.zeros(2 * steps), np.ones(len(target))
+    idle = np.where(measured | (np.arange(2 * steps) % 2 == 1), 0.0, 1.0)
+    equations = _Equations.of(rows)
+    state, weights = np.zeros(2 * steps), np.ones(len(equations.value))
     for iteration in range(_ITERATIONS):
-        weighted = A.multiply(weights[:, None]).T.tocsr()
-        information = (weighted @ A + idle).tocsc()
-        state = np.atleast_1d(spsolve(information, weighted @ target))
-        residual = np.abs(A @ state - target)
+        information, right = equations.normal(weights, idle)
+        state = solveh_banded(information, right)
+        residual = np.abs(equations.residual(state))
         robust = 1.0 / (1.0 + (residual / config.outlier_sigmas) ** 2)
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
-    known = np.where(measured, 1.0, np.nan)
-    sigmas, correlations = marginals(information, steps)
+    log_length, log_unit = state[lengths], state[units]
+    known = np.where(measured[lengths], 1.0, np.nan)
+    sigmas, correlations = marginals(information)
     correlated_sigmas = _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     sigmas, correlated_sigmas = known * sigmas, known * correlated_sigmas
-    by_learned = (evidence.learned + state[steps:] - state[:steps]) / config.learned_sigma
-    by_speed = (np.diff(state[:steps], prepend=np.nan) - evidence.steady) / (evidence.steady_sigma + _LENGTH_SIGMA)
+    by_learned = (evidence.learned + log_unit - log_length) / config.learned_sigma
+    by_speed = (np.diff(log_length, prepend=np.nan) - evidence.steady) / (evidence.steady_sigma + _LENGTH_SIGMA)
     contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (np.abs(by_speed) > _CONTRADICTION_SIGMAS)
-    return StepLengths(known * np.exp(state[:steps]), sigmas, correlated_sigmas, np.exp(state[steps:]), contradicted)
+    return StepLengths(known * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted)
 
 
-def marginals(information: csc_array, steps: int) -> tuple[FloatArray, FloatArray]:
-    """Marginals of every length from an information matrix ``(2 S, 2 S)`` of lengths, then units.
+def marginals(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Marginals of every length from the upper band ``(3, 2 S)`` of an information matrix.
 
-    The matrix is block tridiagonal by step, so the marginal information from all earlier and from all later steps is
-    each a chain of 2x2 Schur complements.
+    Each length is followed by the unit of its step. The matrix is block tridiagonal by step, so the marginal
+    information from all earlier and from all later steps is each a chain of 2x2 Schur complements.
 
     Returns:
         Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean of both sides.
         Errors whose correlation falls by a factor r from step to step have a sum of ``(1 + r) / (1 - r)`` times the
         variance of independent ones.
     """
-    main, neighbour = information.diagonal(), information.diagonal(1)
-    own = np.zeros((steps, 2, 2))
-    own[:, 0, 0], own[:, 1, 1] = main[:steps], main[steps:]
-    own[:, 0, 1] = own[:, 1, 0] = information.diagonal(steps)
-    coupling = np.zeros((steps, 2, 2))  # of a step and the next
-    coupling[:-1, 0, 0], coupling[:-1, 1, 1] = neighbour[: steps - 1], neighbour[steps:]
-    before, after = own.copy(), own.copy()
-    for k in range(1, steps):
-        before[k] -= coupling[k - 1] @ np.linalg.inv(before[k - 1]) @ coupling[k - 1]
-        after[-k - 1] -= coupling[-k - 1] @ np.linalg.inv(after[-k]) @ coupling[-k - 1]
-    sigmas = np.sqrt(np.linalg.inv(before + after - own)[:, 0, 0])
-    pairs = np.block([[before[:-1], coupling[:-1]], [coupling[:-1], after[1:]]])  # (S - 1, 4, 4)
+    neighbour, within, main = (band.reshape(-1, 2) for band in information)
+    own = np.stack([main[:, 0], within[:, 1], within[:, 1], main[:, 1]], axis=1)
+    before, after = _from_before(own, neighbour[1:]), _from_before(own[::-1], neighbour[:0:-1])[::-1]
+    sigmas = np.sqrt(np.linalg.inv((before + after - own).reshape(-1, 2, 2))[:, 0, 0])
+    coupling = np.zeros((len(own) - 1, 2, 2))  # of a step and the next
+    coupling[:, 0, 0], coupling[:, 1, 1] = neighbour[1:].T
+    earlier, later = before[:-1].reshape(-1, 2, 2), after[1:].reshape(-1, 2, 2)
+    pairs = np.block([[earlier, coupling], [coupling, later]])  # (S - 1, 4, 4)
     coupled = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_CORRELATED)
     ends = coupled[:1], coupled[-1:]
     return np.asarray(sigmas), 0.5 * (np.concatenate([ends[0], coupled]) + np.concatenate([coupled, ends[1]]))
+
+
+def _from_before(own: FloatArray, coupling: FloatArray) -> FloatArray:
+    """Information ``(S, 4)`` on each step from its ``own`` ``(S, 4)``, matrices row by row, and from all steps before.
+
+    ``coupling`` ``(S - 1, 2)`` is the diagonal of each block between a step and the next.
+    """
+    chain = own[:1].tolist()
+    for (a, b, _, d), (of_length, of_unit) in zip(own[1:].tolist(), coupling.tolist(), strict=True):
+        a_before, b_before, _, d_before = chain[-1]
+        determinant = a_before * d_before - b_before**2
+        b += of_length * of_unit * b_before / determinant
+        chain.append([a - of_length**2 * d_before / determinant, b, b, d - of_unit**2 * a_before / determinant])
+    return np.array(chain)
 
 
 @dataclass(frozen=True)
@@ -202,19 +211,44 @@ class _Rows:
     sigma: FloatArray
 
 
-def _whitened(rows: list[_Rows], states: int) -> tuple[csr_array, FloatArray]:
-    """Matrix and right side of all equations divided by their sigmas."""
-    columns, entries, places, values = [], [], [], []
-    count = 0
-    for row in rows:
-        known = np.isfinite(row.value) & np.isfinite(row.sigma)
-        place = count + np.arange(int(known.sum()))
-        count += len(place)
-        for side, sign in ((row.plus, 1.0), (row.minus, -1.0)):
-            if side is not None:
-                places.append(place)
-                columns.append(side[known])
-                entries.append(sign / row.sigma[known])
-        values.append(row.value[known] / row.sigma[known])
-    A = coo_array((np.concatenate(entries), (np.concatenate(places), np.concatenate(columns))), shape=(count, states))
-    return A.tocsr(), np.concatenate(values)
+@dataclass(frozen=True)
+class _Equations:
+    """All equations of a system, divided by their sigmas; without a ``minus`` its ``sign`` is zero.
+
+    No equation ties states that are more than two places apart, so that the normal equations are banded.
+    """
+
+    plus: NDArray[np.intp]
+    minus: NDArray[np.intp]
+    sign: FloatArray
+    value: FloatArray
+    sigma: FloatArray
+
+    @classmethod
+    def of(cls, rows: Sequence[_Rows]) -> _Equations:
+        """The equations that are known."""
+        known = [np.isfinite(row.value) & np.isfinite(row.sigma) for row in rows]
+        minus = [row.plus if row.minus is None else row.minus for row in rows]
+        sign = [np.full(len(row.plus), float(row.minus is not None)) for row in rows]
+        columns = [row.plus for row in rows], minus, sign, [row.value for row in rows], [row.sigma for row in rows]
+        return cls(*(np.concatenate([part[k] for part, k in zip(column, known, strict=True)]) for column in columns))
+
+    def residual(self, state: FloatArray) -> FloatArray:
+        """``(M,)`` in sigmas."""
+        return np.asarray((state[self.plus] - self.sign * state[self.minus] - self.value) / self.sigma)
+
+    def normal(self, weights: FloatArray, idle: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side."""
+        count, weights = len(idle), weights / self.sigma**2
+        of_minus = self.sign * weights
+
+        def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
+            return np.asarray(np.bincount(places, values, minlength=count), np.float64)
+
+        later, apart = np.maximum(self.plus, self.minus), np.abs(self.plus - self.minus)
+        band = np.zeros((3, count))
+        band[2] = idle + added(self.plus, weights) + added(self.minus, of_minus)
+        for distance in (1, 2):
+            band[2 - distance] = -added(later, np.where(apart == distance, of_minus, 0.0))
+        right = added(self.plus, weights * self.value) - added(self.minus, of_minus * self.value)
+        return band, right

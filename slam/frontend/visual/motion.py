@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.frames import Ends, RelativePose
 from slam.frontend.visual.step_noise import StepNoise
-from slam.geometry.se3 import FloatArray, invert, make
+from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_RELATIVE_SIGMA = 1e-3
 
@@ -55,10 +55,9 @@ class Motion:
             raise ValueError(f"a motion by {self.relative_pose.source} has no separate noise of its direction")
         return StepNoise(self.relative_pose.sigmas[:3], self.direction_sigmas)
 
-    def with_rotation(self, R_current_previous: FloatArray) -> Motion:
-        """The same translation seen from the current camera, with another rotation ``(3, 3)``."""
-        T_current_previous = make(R_current_previous, invert(self.relative_pose.T_from_to)[:3, 3])
-        return replace(self, relative_pose=replace(self.relative_pose, T_from_to=invert(T_current_previous)))
+    def with_pose(self, T_from_to: FloatArray) -> Motion:
+        """The same with another pose ``(4, 4)``."""
+        return replace(self, relative_pose=replace(self.relative_pose, T_from_to=T_from_to))
 
     def with_length(
         self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: StepNoise

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
-from scipy.sparse import csc_array
 
 from slam.config.sections import LengthConfig
 from slam.frames import Ends, RelativePose
@@ -128,19 +127,18 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
     """The chains of Schur complements give the same as inverting the whole matrix."""
     rng = np.random.default_rng(0)
     steps = 7
-    pairs = [(k, steps + k) for k in range(steps)]
-    pairs += [(first + k, first + k + 1) for first in (0, steps) for k in range(steps - 1)]
+    pairs = [(2 * k, 2 * k + 1) for k in range(steps)]
+    pairs += [(k, k + 2) for k in range(2 * steps - 2)]
     ties = np.zeros((len(pairs), 2 * steps))
     for row, pair in zip(ties, pairs):
         row[list(pair)] = rng.normal(size=2)
     A = np.concatenate([np.eye(2 * steps), ties])
     information = A.T @ A
-    left = np.linalg.inv(information)[:steps, :steps]
+    left = np.linalg.inv(information)[::2, ::2]
     expected = np.sqrt(np.diag(left))
     correlations = np.clip(np.diag(left, 1) / (expected[1:] * expected[:-1]), 0.0, 1.0)
-    banded = np.abs(np.subtract.outer(np.arange(2 * steps), np.arange(2 * steps)))
-    assert (information[(banded != 0) & (banded != 1) & (banded != steps)] == 0).all()
-    sigmas, with_neighbours = marginals(csc_array(information), steps)
+    band = np.array([np.pad(np.diag(information, apart), (apart, 0)) for apart in (2, 1, 0)])
+    sigmas, with_neighbours = marginals(band)
     np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
     both_sides = 0.5 * (np.append(correlations[0], correlations) + np.append(correlations, correlations[-1]))
     np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)

@@ -60,15 +60,6 @@ def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
     assert noisier[5] == pytest.approx(own[5], rel=0.02)
 
 
-def test_another_rotation_keeps_the_translation_in_the_current_camera() -> None:
-    R = se3.from_rotation_vector(np.array([0.02, -0.01, 0.03]), np.zeros(3))[:3, :3]
-    rotated = triangulated_motion().with_rotation(R)
-    T_current_previous = se3.invert(rotated.relative_pose.T_from_to)
-    np.testing.assert_allclose(T_current_previous[:3, :3], R, atol=1e-12)
-    np.testing.assert_allclose(T_current_previous[:3, 3], se3.invert(T_PREVIOUS_CURRENT)[:3, 3], atol=1e-12)
-    np.testing.assert_array_equal(rotated.relative_pose.sigmas, triangulated_motion().relative_pose.sigmas)
-
-
 def test_no_sigma_of_a_translation_is_zero() -> None:
     ahead = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 2.0]))
     sigmas = pose_sigmas(ahead, ROTATION_SIGMAS, np.array([0.004, 0.0, 0.0]), 0.05)

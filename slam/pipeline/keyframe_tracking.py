@@ -6,8 +6,10 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Literal
 
+import cv2
 import numpy as np
 
+from erfsfm.common.threads import usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
@@ -72,6 +74,9 @@ class KeyframeTracking:
         self._camera_height_m = camera_height_m
         self._places: Relocaliser | None = None
         self._front_end: FrontEnd = "steps" if state is None else "both"
+        # the networks, which predict little for keyframes, leave their core to optical flow
+        self._threads_before = cv2.getNumThreads()
+        cv2.setNumThreads(self._threads_before if state is None else usable_cores())
         if state is None:
             self._odometry = None
         else:
@@ -120,8 +125,13 @@ class KeyframeTracking:
         """Choose what measures the frames that follow, until that is one of both."""
         if self._front_end == "both":
             self._front_end = choose(self._config, self._camera_height_m, drive)
-        if self._front_end == "steps":
+        if self._front_end == "steps" and self._odometry is not None:
             self._odometry = None
+            self.close()
+
+    def close(self) -> None:
+        """Give the cores back that optical flow had."""
+        cv2.setNumThreads(self._threads_before)
 
     def measures(self, drive: Drive, index: int) -> bool:
         """Whether keyframes alone measure the motion to one of the last frames.

@@ -104,6 +104,7 @@ class Observer:
 
     def close(self) -> None:
         """End the threads; tasks that have not begun are dropped."""
+        self._keyframes.close()
         for executor in (self._networks, self._beside):
             executor.shutdown(wait=True, cancel_futures=True)
 
@@ -120,13 +121,11 @@ class Observer:
             self._leave_out(index, str(frame))
             return
         self._unread = 0
-        verdict: Verdict = "new"
-        if self._config.gaps.enabled:
-            with self._stopwatch.stage("read"):
-                verdict = self._gate.check(frame)
-            if isinstance(verdict, MeasurementFailure):
-                self._leave_out(index, verdict.reason)
-                return
+        with self._stopwatch.stage("read"):
+            verdict: Verdict = self._gate.check(frame) if self._config.gaps.enabled else "new"
+        if isinstance(verdict, MeasurementFailure):
+            self._leave_out(index, verdict.reason)
+            return
         pending = self._submit_networks(frame)
         try:
             self._process_pending()

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 
+import numpy as np
+
 from erfsfm.common.lock import FolderLock
 from erfsfm.common.signals import calling_on_signals, raising_on_termination
 from erfsfm.inference import DepthPosePredictor
@@ -78,6 +80,8 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     depth = open_depth(settings.depth, intrinsics, None)
     predictor = make_predictor(networks, depth, settings.depth, intrinsics)
     name = Path(request.source).stem or "live"
+    blank = np.zeros((intrinsics.height, intrinsics.width, 3), np.uint8)
+    networks.depth(blank), networks.poses([blank] * (networks.sources + 1))  # loaded before images come
     growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
     require_possible(growing, settings, predictor.sources + 1)
     sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)

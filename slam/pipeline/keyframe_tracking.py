@@ -74,12 +74,11 @@ class KeyframeTracking:
         self._camera_height_m = camera_height_m
         self._places: Relocaliser | None = None
         self._front_end: FrontEnd = "steps" if state is None else "both"
-        # the networks, which predict little for keyframes, leave their core to optical flow
         self._threads_before = cv2.getNumThreads()
-        cv2.setNumThreads(self._threads_before if state is None else usable_cores())
-        if state is None:
-            self._odometry = None
-        else:
+        self._odometry: KeyframeOdometry | None = None
+        if state is not None:
+            # the networks, which predict little for keyframes, leave their core to optical flow
+            cv2.setNumThreads(usable_cores())
             self._odometry = KeyframeOdometry(config, intrinsics, seed, state, on_keyframe)
 
     def state(self) -> KeyframeOdometryState | None:

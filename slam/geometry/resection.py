@@ -41,7 +41,7 @@ def consensus(
 ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]] | None:
     """Rotation vector ``(3,)``, translation ``(3,)`` and inlier rows with most support, or None.
 
-    Samples of three points, each good one refined on its inliers (OpenCV's USAC).
+    Samples of three points (OpenCV's USAC, without its local optimisation, which `refine` makes needless).
 
     Args:
         points: ``(M, 3)``.
@@ -55,7 +55,7 @@ def consensus(
     params = cv2.UsacParams()
     params.maxIterations, params.threshold, params.confidence = iterations, reprojection_px, _CONFIDENCE
     params.sampler, params.score = cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    params.loMethod = cv2.LOCAL_OPTIM_NULL
     found, _, rotation, translation, chosen = cv2.solvePnPRansac(
         points[order], pixels[order], K.copy(), None, params=params
     )

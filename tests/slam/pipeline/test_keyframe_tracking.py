@@ -1,11 +1,13 @@
 import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import room
 from oracle import OraclePredictor
 
+from erfsfm.common.threads import single_threaded_opencv
 from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose
@@ -105,6 +107,20 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
     assert [k for k in predicted if k >= 20] == [keyframe.index for keyframe in keyframes if keyframe.index >= 20]
     assert [snippet.target for snippet in closed.trusted if snippet.target > 18] == [22, 26, 30, 34]
     assert len(closed.trusted[0].sources) == 4 and not closed.interpolated
+
+
+@pytest.mark.parametrize("camera_height_m", [None, 1.65])
+def test_opencv_takes_all_cores_for_keyframes_alone(
+    camera_height_m: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A known height is that of a vehicle, whose networks need a core of their own."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    truth = room.walk(2)
+    oracle, config = OraclePredictor(truth, lambda k: room.depth_map(truth[k])), SlamConfig()
+    with single_threaded_opencv():
+        with Observer(oracle, room.INTRINSICS, config, Stopwatch(), camera_height_m=camera_height_m):
+            assert cv2.getNumThreads() == (3 if camera_height_m is None else 1)
+        assert cv2.getNumThreads() == 1
 
 
 def written(state: FrontEndState, path: Path) -> list[bytes]:

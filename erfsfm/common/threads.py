@@ -26,17 +26,17 @@ def usable_cores() -> int:
 
 
 @contextmanager
-def single_threaded_opencv() -> Iterator[None]:
-    """OpenCV computes in the calling thread alone.
+def opencv_threads(count: int) -> Iterator[None]:
+    """OpenCV computes in so many threads; with one, in the calling thread alone.
 
     Its threads also have to end before a process is forked: the child would wait forever for threads that it lacks.
     """
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(count)
     try:
         yield
     finally:
-        cv2.setNumThreads(threads)
+        cv2.setNumThreads(before)
 
 
 def stay_single_threaded() -> None:
@@ -63,5 +63,5 @@ def take_working_memory() -> None:
 @contextmanager
 def limit_library_threads() -> Iterator[None]:
     """OpenCV and BLAS compute in the calling threads alone, for programs that run several threads of their own."""
-    with single_threaded_opencv(), threadpool_limits(1, "blas"):
+    with opencv_threads(1), threadpool_limits(1, "blas"):
         yield

@@ -30,7 +30,7 @@ from erfsfm.common.lock import FolderLock
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
-from erfsfm.common.threads import single_threaded_opencv
+from erfsfm.common.threads import opencv_threads
 from erfsfm.config import ExperimentConfig, Precision, TrainingConfig
 from erfsfm.data.exact_depth import by_label, stacked
 from erfsfm.data.recordings import Recording
@@ -201,7 +201,7 @@ def _fit(
 ) -> None:
     """Run the training loop; errors that stop it become one line."""
     try:
-        with single_threaded_opencv(), warnings.catch_warnings():
+        with opencv_threads(1), warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
             warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
             warnings.filterwarnings("ignore", message=".*when using `ckpt_path`.*")

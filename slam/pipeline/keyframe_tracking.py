@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from itertools import islice
 from typing import Literal
 
-import cv2
 import numpy as np
 
-from erfsfm.common.threads import usable_cores
+from erfsfm.common.threads import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
@@ -74,11 +74,11 @@ class KeyframeTracking:
         self._camera_height_m = camera_height_m
         self._places: Relocaliser | None = None
         self._front_end: FrontEnd = "steps" if state is None else "both"
-        self._threads_before = cv2.getNumThreads()
+        self._cores = ExitStack()
         self._odometry: KeyframeOdometry | None = None
         if state is not None:
             # the networks, which predict little for keyframes, leave their core to optical flow
-            cv2.setNumThreads(usable_cores())
+            self._cores.enter_context(opencv_threads(usable_cores()))
             self._odometry = KeyframeOdometry(config, intrinsics, seed, state, on_keyframe)
 
     def state(self) -> KeyframeOdometryState | None:
@@ -124,13 +124,13 @@ class KeyframeTracking:
         """Choose what measures the frames that follow, until that is one of both."""
         if self._front_end == "both":
             self._front_end = choose(self._config, self._camera_height_m, drive)
-        if self._front_end == "steps" and self._odometry is not None:
+        if self._front_end == "steps":
             self._odometry = None
             self.close()
 
     def close(self) -> None:
         """Give the cores back that optical flow had."""
-        cv2.setNumThreads(self._threads_before)
+        self._cores.close()
 
     def measures(self, drive: Drive, index: int) -> bool:
         """Whether keyframes alone measure the motion to one of the last frames.

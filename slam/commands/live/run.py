@@ -80,10 +80,11 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     depth = open_depth(settings.depth, intrinsics, None)
     predictor = make_predictor(networks, depth, settings.depth, intrinsics)
     name = Path(request.source).stem or "live"
-    blank = np.zeros((intrinsics.height, intrinsics.width, 3), np.uint8)
-    networks.depth(blank), networks.poses([blank] * (networks.sources + 1))  # loaded before images come
     growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
     require_possible(growing, settings, predictor.sources + 1)
+    blank = np.zeros((intrinsics.height, intrinsics.width, 3), np.uint8)
+    networks.depth(blank)  # both are loaded before images come
+    networks.poses([blank] * (networks.sources + 1))
     sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
     poses = LivePoses(predictor.sources, sequence.camera_height_m, settings)

@@ -131,20 +131,21 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, config.ratio_sigma)
     learned_sigma = config.learned_sigma * np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
-    rows = [
-        _Rows(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
-        _Rows(lengths, None, evidence.absolute, evidence.absolute_sigma),
-        _Rows(lengths, units, evidence.learned, learned_sigma),
-        _Rows(lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
-        _Rows(units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
+    zero = np.full(steps, 2 * steps)  # behind the last state
+    parts = [
+        _Equations(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
+        _Equations(lengths, zero, evidence.absolute, evidence.absolute_sigma),
+        _Equations(lengths, units, evidence.learned, learned_sigma),
+        _Equations(lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
+        _Equations(units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
         # one prior on the unit of the whole drive, divided among its steps
-        _Rows(units, None, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
+        _Equations(units, zero, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
     ]
     measured = np.zeros(2 * steps, dtype=bool)
-    for row in rows[:3]:
-        measured[row.plus[np.isfinite(row.value)]] = True
+    for part in parts[:3]:
+        measured[part.plus[np.isfinite(part.value)]] = True
     idle = np.where(measured | (np.arange(2 * steps) % 2 == 1), 0.0, 1.0)
-    equations = _Equations.of(rows)
+    equations = _Equations.known_of(parts)
     state, weights = np.zeros(2 * steps), np.ones(len(equations.value))
     for iteration in range(_ITERATIONS):
         information, right = equations.normal(weights, idle)
@@ -202,53 +203,38 @@ def _from_before(own: FloatArray, coupling: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """Equations ``state[plus] - state[minus] = value``, each with its sigma; those with NaN are left out."""
-
-    plus: np.ndarray[tuple[int], np.dtype[np.int64]]
-    minus: np.ndarray[tuple[int], np.dtype[np.int64]] | None
-    value: FloatArray
-    sigma: FloatArray
-
-
-@dataclass(frozen=True)
 class _Equations:
-    """All equations of a system, divided by their sigmas; without a ``minus`` its ``sign`` is zero.
+    """``state[plus] - state[minus] = value``, M of them with a ``sigma`` each; the place behind the last state is zero.
 
     No equation ties states that are more than two places apart, so that the normal equations are banded.
     """
 
     plus: NDArray[np.intp]
     minus: NDArray[np.intp]
-    sign: FloatArray
     value: FloatArray
     sigma: FloatArray
 
     @classmethod
-    def of(cls, rows: Sequence[_Rows]) -> _Equations:
-        """The equations that are known."""
-        known = [np.isfinite(row.value) & np.isfinite(row.sigma) for row in rows]
-        minus = [row.plus if row.minus is None else row.minus for row in rows]
-        sign = [np.full(len(row.plus), float(row.minus is not None)) for row in rows]
-        columns = [row.plus for row in rows], minus, sign, [row.value for row in rows], [row.sigma for row in rows]
-        return cls(*(np.concatenate([part[k] for part, k in zip(column, known, strict=True)]) for column in columns))
+    def known_of(cls, parts: Sequence[_Equations]) -> _Equations:
+        """All equations without NaN."""
+        known = [np.isfinite(part.value) & np.isfinite(part.sigma) for part in parts]
+        columns = zip(*((p.plus[k], p.minus[k], p.value[k], p.sigma[k]) for p, k in zip(parts, known)), strict=True)
+        return cls(*map(np.concatenate, columns))
 
     def residual(self, state: FloatArray) -> FloatArray:
         """``(M,)`` in sigmas."""
-        return np.asarray((state[self.plus] - self.sign * state[self.minus] - self.value) / self.sigma)
+        with_zero = np.append(state, 0.0)
+        return np.asarray((with_zero[self.plus] - with_zero[self.minus] - self.value) / self.sigma)
 
     def normal(self, weights: FloatArray, idle: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side."""
-        count, weights = len(idle), weights / self.sigma**2
-        of_minus = self.sign * weights
+        weights = weights / self.sigma**2
 
         def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
-            return np.asarray(np.bincount(places, values, minlength=count), np.float64)
+            return np.asarray(np.bincount(places, values, len(idle) + 1)[: len(idle)], np.float64)
 
         later, apart = np.maximum(self.plus, self.minus), np.abs(self.plus - self.minus)
-        band = np.zeros((3, count))
-        band[2] = idle + added(self.plus, weights) + added(self.minus, of_minus)
-        for distance in (1, 2):
-            band[2 - distance] = -added(later, np.where(apart == distance, of_minus, 0.0))
-        right = added(self.plus, weights * self.value) - added(self.minus, of_minus * self.value)
-        return band, right
+        off_diagonal = (-added(later, np.where(apart == distance, weights, 0.0)) for distance in (2, 1))
+        diagonal = idle + added(self.plus, weights) + added(self.minus, weights)
+        right = added(self.plus, weights * self.value) - added(self.minus, weights * self.value)
+        return np.array([*off_diagonal, diagonal]), right

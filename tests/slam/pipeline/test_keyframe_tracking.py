@@ -7,7 +7,7 @@ import pytest
 import room
 from oracle import OraclePredictor
 
-from erfsfm.common.threads import single_threaded_opencv
+from erfsfm.common.threads import opencv_threads
 from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose
@@ -117,7 +117,7 @@ def test_opencv_takes_all_cores_for_keyframes_alone(
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     truth = room.walk(2)
     oracle, config = OraclePredictor(truth, lambda k: room.depth_map(truth[k])), SlamConfig()
-    with single_threaded_opencv():
+    with opencv_threads(1):
         with Observer(oracle, room.INTRINSICS, config, Stopwatch(), camera_height_m=camera_height_m):
             assert cv2.getNumThreads() == (3 if camera_height_m is None else 1)
         assert cv2.getNumThreads() == 1

@@ -1,7 +1,8 @@
 """Depth maps of a drive in one picture, and their errors over distance: image, network, refined depth, truth.
 
 Runs the whole system with each of the weights, and refines depth in each of the ways; depth is in metres as the run
-gives it, no scale is fitted. Means have the standard error of blocks of five keyframes.
+gives it, no scale is fitted, and what is beyond 80 m counts as 80 m. Means have the standard error of blocks of five
+keyframes.
 
 Example: python tools/depth_page.py docs/images/depth-0013.jpg --dataset KITTI_RAW/DRIVE --show 12 28
 """
@@ -93,7 +94,7 @@ def _note(
         size = (truth.shape[1], truth.shape[0])
         guess = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float64)
         both = known & np.isfinite(guess)
-        relative = np.abs(guess[both] - truth[both]) / truth[both]
+        relative = np.abs(np.minimum(guess[both], EDGES_M[-1]) - truth[both]) / truth[both]
         errors.setdefault(method, {})[keyframe.frame] = np.stack([truth[both], relative])
 
 

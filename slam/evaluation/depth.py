@@ -26,7 +26,10 @@ class DepthMetrics(Record):
 
 
 class DepthErrors:
-    """Collects the pixels with truth between 1 and 80 m of many frames, of very many evenly spread ones."""
+    """Collects the pixels with truth between 1 and 80 m of many frames, of very many evenly spread ones.
+
+    Estimates beyond 80 m, such as of sky at the outline of a roof, count as 80 m: the field's rule (Eigen et al. 2014).
+    """
 
     def __init__(self) -> None:
         self._depths: list[NDArray[np.float32]] = []
@@ -58,7 +61,8 @@ class DepthErrors:
         at = (2 * v + 1) * height // (2 * true_height), (2 * u + 1) * width // (2 * true_width)
         sigma = np.full(len(v), np.nan) if relative_sigma is None else relative_sigma[at]
         known = np.isfinite(depth[at]) & (depth[at] > 0) & ~np.isinf(sigma)
-        self._depths.append(np.stack([depth[at], truth[v, u], sigma])[:, known].astype(np.float32))
+        estimate = np.minimum(depth[at], LARGEST_M)
+        self._depths.append(np.stack([estimate, truth[v, u], sigma])[:, known].astype(np.float32))
         if len(self._depths) > _MOST_FRAMES:
             self._depths, self._step = self._depths[::2], 2 * self._step
 

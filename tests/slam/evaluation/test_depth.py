@@ -63,6 +63,13 @@ def test_pixels_without_an_estimate_are_not_compared() -> None:
     assert nothing.metrics() is None
 
 
+def test_an_estimate_beyond_the_range_counts_as_its_end() -> None:
+    errors = DepthErrors()
+    errors.add(np.full_like(TRUTH, 4000.0), np.full_like(TRUTH, 64.0))
+    summary = errors.metrics().tree()
+    assert summary is not None and summary["abs_rel"] == pytest.approx(0.25)
+
+
 def test_of_a_long_drive_evenly_spread_frames_are_held() -> None:
     errors = DepthErrors()
     for k in range(3001):

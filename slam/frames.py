@@ -1,7 +1,6 @@
 """Data types shared by the parts of the system: frozen records, two protocols, depth between pixels.
 
-The front end, the graph, the map and the evaluation never import each other; ``slam/pipeline/batch.py``
-passes these between them.
+The front end, the graph and the map never import each other; ``slam/pipeline/batch.py`` passes these between them.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class Intrinsics(Pinhole):
 class Frame:
     """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds.
 
-    Values that depend on the image alone (grey levels, pyramids, features) are computed once and kept by the frame.
+    Values that depend on the image alone (grey levels, thumbnails, the networks' input) are computed once and kept.
     """
 
     index: int

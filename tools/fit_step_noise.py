@@ -1,7 +1,7 @@
 """Fit the noise of steps by image geometry, and what it is worth on drives that the fit did not see.
 
-The ratios of ``VisualOdometryConfig`` (jitter, neighbours) are those of greatest likelihood under Student's t; every
-drive has the same weight. For each drive the table has the coverage of its steps with the ratios in use, and with
+The ratios of ``VisualOdometryConfig`` (jitter, turns, neighbours) are those of greatest likelihood under Student's t;
+every drive has the same weight. For each drive the table has the coverage of its steps with the ratios in use, and with
 ratios fitted to all other drives.
 
 Example: python tools/fit_step_noise.py KITTI:00 KITTI:02 KITTI:05 WORLD --weights sim --cache cache

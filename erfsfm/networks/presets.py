@@ -1,4 +1,4 @@
-"""The paper's networks by name."""
+"""Networks by name: the paper's, and depth networks with a pretrained encoder."""
 
 import difflib
 from dataclasses import dataclass

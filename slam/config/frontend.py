@@ -34,7 +34,7 @@ class VisualOdometryConfig(Section):
     )
     predicted_flow: bool = Field(
         default=True,
-        description="start tracking at the optical flow predicted from learned depth and the previous motion",
+        description="track in the later image warped back by the flow that learned depth and the last motion predict",
     )
     rotation_baseline_steps: int = Field(
         default=2,

@@ -2,9 +2,9 @@
 
 With calibrated noise (`erfsfm.pose_noise`) each pair of frames gets one factor: the mean of its measurements by
 overlapping snippets, with the correlation of their errors. On the drive this noise is scaled to the
-disagreement with image geometry, separately by turn rate, and the noise of image geometry is added
-(``docs/design/noise-and-the-pose-graph.md``). Errors have heavier tails than normal ones and are correlated from
-snippet to snippet: the graph takes inflated sigmas for that (``docs/design/noise-and-the-pose-graph.md``).
+disagreement with image geometry, separately by turn rate, and the noise of image geometry is added. Errors have
+heavier tails than normal ones and are correlated from snippet to snippet: the graph takes inflated sigmas for that
+(``docs/design/noise-and-the-pose-graph.md``).
 
 Without calibrated noise, sigmas are proportional to the motion. For a pair n frames apart the rotation sigma is
 ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` times the length plus a

@@ -1,8 +1,7 @@
 """Every motion that image geometry measured, kept once under its two frames, unscaled.
 
-A step is from a frame to a later one: usually the next, but it may also cross a gap or start at a keyframe. The
-links of a drive are consecutive steps from the first frame to the last; where no step was measured, a
-link is to the next frame.
+A step is from a frame to a later one: usually the next, but it may also cross a gap. The links of a drive are
+consecutive steps from the first frame to the last; where no step was measured, a link is to the next frame.
 """
 
 from __future__ import annotations

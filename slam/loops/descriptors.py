@@ -36,8 +36,8 @@ class FeatureExtractor:
         Args:
             frame: the frame, at the size of the intrinsics.
             depth_unscaled: its learned z-depth ``(H, W)``.
-            height_unscaled: camera height in the same unit; where known, depths farther than
-                ``max_depth_heights`` of it are not trusted.
+            height_unscaled: camera height in the same unit; where known, depths of more than
+                30 times as much are not trusted.
         """
         pixels, descriptors = self.corners(frame.grey)
         z = nearest_depth(depth_unscaled, pixels)

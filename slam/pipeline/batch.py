@@ -49,7 +49,7 @@ from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d_beside
-from slam.runtime.threads import read_ahead
+from slam.runtime.threads import CORES, read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.sequences.continued import Continued
 
@@ -249,7 +249,7 @@ class SlamPipeline:
         mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
         selected = tsdf_map.select([keyframe.index for keyframe in keyframes], T_world_camera)
-        with closing(read_ahead(depths.at, selected)) as ahead:
+        with closing(read_ahead(depths.at, selected, CORES)) as ahead:
             for done, keyframe in enumerate(self._watch.each("depth refinement", ahead), 1):
                 if compare is not None:
                     compare(keyframe)

@@ -16,19 +16,19 @@ S = TypeVar("S")
 T = TypeVar("T")
 P = ParamSpec("P")
 
-_CORES = 2
+CORES = 2  # used side by side
 
 
-def read_ahead(read: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None, None]:
-    """The result of ``read`` for each number, computed in another thread while the one before is used.
+def read_ahead(read: Callable[[int], T], numbers: Sequence[int], threads: int = 1) -> Generator[T, None, None]:
+    """The result of ``read`` for each number, computed in other ``threads`` while the one before is used.
 
-    The thread ends with the numbers, or when the generator is closed.
+    They end with the numbers, or when the generator is closed. With more than one, calls must be independent.
     """
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead") as ahead:
+    with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="ahead") as ahead:
         waiting: deque[Future[T]] = deque()
         for number in numbers:
             waiting.append(ahead.submit(read, number))
-            if len(waiting) > 1:
+            if len(waiting) > threads:
                 yield waiting.popleft().result()
         for last in waiting:
             yield last.result()
@@ -36,7 +36,7 @@ def read_ahead(read: Callable[[int], T], numbers: Sequence[int]) -> Generator[T,
 
 def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
     """The result of ``do`` for each item, in order; the calls must be independent."""
-    with ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="side") as side:
+    with ThreadPoolExecutor(max_workers=CORES, thread_name_prefix="side") as side:
         return list(side.map(do, items))
 
 

@@ -85,7 +85,8 @@ def settings_to_continue(folder: Path, config: str | Path | None, overrides: Seq
     own = load_config(RunFolder(folder).require(CONFIG))
     settings = load_config(folder / CONFIG, overrides)
     # another path may lead to the same source, or to more files of it: its identity is compared later
-    depth = settings.depth.model_copy(update={"source": own.depth.source, "refine": own.depth.refine})
+    after = {name: getattr(own.depth, name) for name in ("source", "refine", "fusion")}
+    depth = settings.depth.model_copy(update=after)
     compared = settings.model_copy(update={"depth": depth})
     for name in _FIXED_SECTIONS:
         if getattr(compared, name) != getattr(own, name):

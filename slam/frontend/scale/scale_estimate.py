@@ -15,7 +15,7 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SlamError
 
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
-_REJECTION_MADS = 3.0  # distance from the median beyond which a frame is left out, median absolute deviations
+_REJECTION_SIGMAS = 3.0  # distance from the median beyond which a frame is left out
 MIN_FRAMES = 5  # least number of usable frames of a scale
 _SMOOTHING_FRAMES = 41  # window over which the scale of a frame is averaged, frames
 
@@ -112,7 +112,7 @@ def estimate_scale(ratios: FloatArray) -> ScaleEstimate | MeasurementFailure:
         return MeasurementFailure(f"only {len(ratios)} frames measure the scale, {MIN_FRAMES} are needed")
     logarithms = np.log(ratios)
     deviations = np.abs(logarithms - np.median(logarithms))
-    kept = logarithms[deviations <= _REJECTION_MADS * mad_sigma(deviations) + 1e-12]
+    kept = logarithms[deviations <= _REJECTION_SIGMAS * mad_sigma(deviations) + 1e-12]
     spread = mad_sigma(kept - np.median(kept))
     return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
@@ -129,7 +129,7 @@ def scale_track(
     """
     height = 1.0 if camera_height_m is None else camera_height_m
     ratios = np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])
-    bound = _REJECTION_MADS * max(estimate.spread, 0.02)
+    bound = _REJECTION_SIGMAS * max(estimate.spread, 0.02)
     ratios[np.abs(np.log(ratios / estimate.value)) > bound] = np.nan
     half = _SMOOTHING_FRAMES // 2
     track = np.full(len(ratios), estimate.value)

@@ -124,8 +124,8 @@ class VisualOdometry:
             previous: the earlier frame, at the size of the intrinsics.
             current: a later frame, measured once.
             depth_previous_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
-            height_unscaled: camera height in the same unit; where known, farther depths than
-                ``max_depth_heights`` of it are not trusted.
+            height_unscaled: camera height in the same unit; where known, depths of more than
+                30 times as much are not trusted.
             standing: pixels ``(h, w)`` that do not show the world, of images of any size; None where all do.
         """
         previous, current = self._working.frame(previous), self._working.frame(current)

@@ -1,6 +1,6 @@
 """The size of image at which corners are measured: the recording's own, of large images a megapixel.
 
-All bounds in pixels are for images of a third of a megapixel to a whole one. Larger images are no sharper: a pixel of
+All bounds in pixels are for images of a tenth of a megapixel to a whole one. Larger images are no sharper: a pixel of
 theirs has more noise and less contrast, corners crowd on few objects, and the time grows with the pixels.
 """
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from threading import Event
+from threading import Barrier, Event
 
 import pytest
 
@@ -28,6 +28,16 @@ def test_one_is_read_while_another_is_used() -> None:
 def test_nothing_and_one_are_read_too() -> None:
     assert list(read_ahead(str, range(3, 3))) == []
     assert list(read_ahead(str, range(3, 4))) == ["3"]
+
+
+def test_two_threads_read_at_once_and_in_order() -> None:
+    both = Barrier(2)
+
+    def read(number: int) -> int:
+        both.wait(10.0)
+        return number
+
+    assert list(read_ahead(read, range(6), threads=2)) == [0, 1, 2, 3, 4, 5]
 
 
 def test_an_error_of_reading_is_raised_in_order() -> None:

@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DOCS := .venv-docs
-# An index of torch builds, if another than the default is wanted (see README, "Which torch")
+# An index of torch builds, if another than the default is wanted (see docs/getting-started.md)
 TORCH_INDEX ?=
 
 export OMP_WAIT_POLICY ?= PASSIVE

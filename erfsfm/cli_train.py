@@ -28,7 +28,7 @@ def train(
     seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
     device: Device = "auto",
 ) -> None:
-    """Train without labels; OUTPUT is what --weights takes.
+    """Train a depth and a pose network; OUTPUT is what --weights takes.
 
     Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
     """

@@ -42,7 +42,7 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
         )
     if mode == "reference" and sequence.reference is None:
         raise SlamError(
-            f"scale mode reference needs true poses; {sequence.name} has none: choose camera-height or none"
+            f"scale mode reference needs true poses; {sequence.name} has none: choose another scale.mode"
         )
     if mode == "camera-height" and sequence.camera_height_m is None:
         raise SlamError(
@@ -54,7 +54,7 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
     if mode == "known" and grows:
         raise SlamError(
             f"scale mode known needs frames of a whole sequence, and {sequence.name} grows: "
-            "choose camera-height or none"
+            "choose another scale.mode"
         )
     if mode == "known":
         known_frames(config.scale, sequence.stamps)

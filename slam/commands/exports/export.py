@@ -59,7 +59,7 @@ def export(
         folder: the run.
         what: ``mesh`` (PLY or glTF by the end of ``output``), ``cloud`` (PLY, LAS or LAZ), ``trajectory`` (the
             optimised one: TUM where ``output`` ends in ``.tum`` or ``.tum.txt``, else KITTI), ``graph`` (g2o),
-            ``colmap`` (a model in text form), ``nerfstudio`` (images and ``transforms.json``), ``raster`` (heights
+            ``colmap`` (a model), ``nerfstudio`` (images and ``transforms.json``), ``raster`` (heights
             and colours from above) or ``occupancy`` (a grid for ROS).
         output: the file; for ``colmap``, ``nerfstudio`` and ``raster`` the folder.
         up: ``y-down`` as the run has it; ``z``: x right, y ahead, z up; ``y-up``: x right, y up, z backwards. Cameras

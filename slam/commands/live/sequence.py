@@ -64,5 +64,5 @@ def calibration_of(camera: str, given: Path | None, source: Source) -> CameraFil
     found = beside(*places)
     if found is None:
         looked = f"; no {CAMERA_FILE} is in {' or '.join(map(str, places))}" if places else ""
-        raise SequenceError(f"{camera} needs its calibration: give --calibration {CAMERA_FILE} or fov=70{looked}")
+        raise SequenceError(f"{camera} needs its calibration: give --camera {CAMERA_FILE} or fov=70{looked}")
     return found

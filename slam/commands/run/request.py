@@ -51,7 +51,7 @@ class RunRequest:
     )
     output: Output = None
     cache: Annotated[
-        Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")
+        Path | None, typer.Option(help="folder that keeps network outputs for later runs")
     ] = None
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None
     continues: Annotated[

@@ -370,7 +370,7 @@ def test_a_video_plays_at_its_own_speed(video: Path, suffix: str) -> None:
     video = video.rename(video.with_suffix(suffix))
     source = VideoSource(str(video), 1.0)
     assert calibration_of(str(video), Path("fov=70"), source).fps == 20.0
-    with pytest.raises(SequenceError, match=r"give --calibration camera\.yaml or fov=70; no camera\.yaml is in"):
+    with pytest.raises(SequenceError, match=r"give --camera camera\.yaml or fov=70; no camera\.yaml is in"):
         calibration_of(str(video), None, source)
     stamps = [stamp for stamp, _ in source.images(Event())]
     np.testing.assert_allclose(stamps, np.arange(8) / 20.0)

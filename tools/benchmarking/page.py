@@ -63,7 +63,7 @@ Every drive:
 
 def ablation_tables(results: Sequence[JobResult]) -> str:
     """Ablation: errors relative to those of everything on, then the errors themselves."""
-    errors, others = (m.ATE_7, m.ATE_6, m.R_REL), (m.LOOPS, m.COVERAGE, m.TRIANGLES, m.MEMORY)
+    errors, others = (m.ATE_7, m.ATE_6, m.R_REL), (m.LOOPS, m.COVERAGE, m.MEMORY)
     columns = {f"{q.title}: ratio (worst)": against_everything(q, results) for q in errors}
     columns |= {q.title: m.average(q) for q in others}
     drives = grouped(results, drive, weights)

@@ -183,18 +183,23 @@ class DepthPosePredictor:
             image: ``(H, W, 3)`` uint8 RGB of any size.
 
         Returns:
-            ``(H, W)`` float32, positive, at the image's size. Disparity is what is interpolated.
+            ``(H, W)`` float32, positive, at the image's size. Disparity is what is interpolated. The network may see
+            the image larger than in its training (`ModelRecord.depth_input`).
         """
         require_image(image)
-        height, width = image.shape[:2]
-        return depth_at(self.disparity(image), height, width)
+        (height, width), size = image.shape[:2], self.record.depth_input
+        if size is None:
+            return depth_at(self.disparity(image), height, width)
+        output = self._networks.depth(self._input(image, size.height, size.width))[0, 0]
+        return depth_at(self._finite(output, "depth") * np.float32(size.disparity), height, width)
 
     def prepare(self, image: NDArray[np.uint8]) -> PreparedImage:
         """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image."""
-        return PreparedImage(self._input(image))
+        network = self.record.network
+        return PreparedImage(self._input(image, network.height, network.width))
 
     def disparity(self, image: NDArray[np.uint8] | PreparedImage) -> NDArray[np.float32]:
-        """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size.
+        """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the size of the training, as of a snippet.
 
         Raises:
             CheckpointError: the network's output is not finite.
@@ -237,15 +242,16 @@ class DepthPosePredictor:
             )
         return output
 
-    def _input(self, image: NDArray[np.uint8]) -> Array:
-        """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
+    @staticmethod
+    def _input(image: NDArray[np.uint8], height: int, width: int) -> Array:
+        """An image at a network's size, in [-1, 1], ``(1, 3, height, width)``."""
         require_image(image)
-        resized = resize_image(image, self.record.network.height, self.record.network.width)
+        resized = resize_image(image, height, width)
         scaled = resized.astype(np.float32) / np.float32(127.5) - np.float32(1)
         return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
 
     def _array(self, image: NDArray[np.uint8] | PreparedImage) -> Array:
-        return image.array if isinstance(image, PreparedImage) else self._input(image)
+        return image.array if isinstance(image, PreparedImage) else self.prepare(image).array
 
 
 def require_image(image: object) -> None:

@@ -23,6 +23,14 @@ SHIPPED = Path(__file__).parent / "weights"
 FILES = ("depth.safetensors", "pose.safetensors")
 
 
+class DepthInput(Section):
+    """Size at which the depth network sees single images, where that is not the size of its training."""
+
+    height: int = Field(ge=1, le=4096, description="of the network's input, pixels")
+    width: int = Field(ge=1, le=4096, description="of the network's input, pixels")
+    disparity: float = Field(default=1.0, gt=0, description="factor on its output that keeps the unit of the training")
+
+
 class ModelRecord(Section):
     """Metadata of a pair of networks: all but their weights."""
 
@@ -33,6 +41,7 @@ class ModelRecord(Section):
     networks: Literal["both", "depth", "pose"] = Field(default="both", description="which of the two are there")
     trained_on: list[str] = Field(description="recordings and frame ranges seen in training: the leak record")
     licence: str = Field("unknown: depends on the training data", description="of the weights")
+    depth_input: DepthInput | None = Field(default=None, description="of single images, if not as in the training")
     step: int = 0
     metrics: dict[str, float] = Field(default_factory=dict, description="of the last validation")
     version: str = ""

@@ -120,8 +120,8 @@ def _depth(networks: RawNetworks, image: NDArray[np.uint8], fidelity: Fidelity) 
     """Unscaled depth at the image's size."""
     if fidelity == "default":
         return networks.depth(image)
-    network = networks.record.network
-    depth = networks.depth(resize_image(image, network.height, network.width))
+    size = networks.record.depth_input or networks.record.network
+    depth = networks.depth(resize_image(image, size.height, size.width))
     height, width = image.shape[:2]
     return np.asarray(zoom(depth, (height / depth.shape[0], width / depth.shape[1]), order=3), dtype=np.float32)
 

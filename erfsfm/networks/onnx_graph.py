@@ -20,7 +20,7 @@ Array = NDArray[np.float32]
 
 
 class OnnxGraph:
-    """A network that is exported at its first call and run by ONNX Runtime from then on.
+    """A network that is exported at its first call with inputs of each size and run by ONNX Runtime from then on.
 
     Outputs equal the network's up to rounding. A network with large deformable layers stays as it is: its graph takes
     minutes to make, and the compiled path of `erfsfm.networks.deformable` is faster.
@@ -30,21 +30,21 @@ class OnnxGraph:
         """Prepare.
 
         Args:
-            network: gives it in evaluation mode, with one output; not called where its graph is kept. All inputs will
-                have the shapes of the first.
+            network: gives it in evaluation mode, with one output; not called where its graph is kept.
             threads: to run on.
             identity: of the network with its weights, by which the graph is kept on disk; empty: it is not.
         """
         self._network = network
         self._threads = threads
         self._identity = identity
-        self._infer: Callable[..., Array] | None = None
+        self._infer: dict[str, Callable[..., Array]] = {}  # by the shapes of the inputs
 
     def __call__(self, *inputs: Array | list[Array]) -> Array:
         """The network's output."""
-        if self._infer is None:
-            self._infer = self._chosen(*inputs)
-        return self._infer(*inputs)
+        key = self._key([array.shape for array in _flat(inputs)])
+        if key not in self._infer:
+            self._infer[key] = self._chosen(key, *inputs)
+        return self._infer[key](*inputs)
 
     def is_kept(self, *shapes: tuple[int, ...]) -> bool:
         """Whether there is a graph for inputs of these shapes on disk."""
@@ -53,8 +53,7 @@ class OnnxGraph:
     def _key(self, shapes: Sequence[tuple[int, ...]]) -> str:
         return f"{self._identity} {list(shapes)}"
 
-    def _chosen(self, *inputs: Array | list[Array]) -> Callable[..., Array]:
-        key = self._key([array.shape for array in _flat(inputs)])
+    def _chosen(self, key: str, *inputs: Array | list[Array]) -> Callable[..., Array]:
         graph = kept(key) if self._identity else None
         if graph is None:
             from erfsfm.networks.deformable import has_large_sampling

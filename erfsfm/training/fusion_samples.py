@@ -13,7 +13,7 @@ from erfsfm.common.errors import TrainingError
 from erfsfm.data.exact_depth import FARTHEST_M
 from erfsfm.data.recordings import Recording
 from erfsfm.data.weather import weathered
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import DepthPosePredictor, depth_at
 from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.evidence import evidence
 from erfsfm.mvs.neighbours import BASELINES, neighbours
@@ -111,7 +111,7 @@ class FusionSamples:
         """Learned depth with an error of its unit; often bent or blurred, as that of networks on unknown streets."""
         rng = self._rng
         height, width = truth.shape
-        depth = self._networks.depth(image)
+        depth = depth_at(self._networks.disparity(image), height, width)  # as a run has it
         known = truth > 0
         depth = depth * np.float32(np.median(truth[known] / depth[known]) * np.exp(rng.normal(0, _SCALE_SPREAD)))
         if rng.random() < 0.6:

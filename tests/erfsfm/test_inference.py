@@ -24,7 +24,7 @@ from erfsfm.inference import (
     save_depth,
     save_image,
 )
-from erfsfm.model_record import FILES, ModelRecord
+from erfsfm.model_record import FILES, DepthInput, ModelRecord
 
 RNG = np.random.default_rng(3)
 
@@ -136,6 +136,19 @@ def test_other_arrays_are_refused(predictor: DepthPosePredictor, wrong: NDArray[
     for ask in (predictor.depth, predictor.prepare):
         with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 RGB; got"):
             ask(wrong)
+
+
+def test_a_single_image_may_be_seen_at_another_size_than_in_training() -> None:
+    larger = DepthInput(height=64, width=128, disparity=0.5)
+    plain = model()
+    record = plain.record.model_copy(update={"depth_input": larger})
+    predictor = DepthPosePredictor.of(Model(record, plain.depth_net, plain.pose_net))
+    large = image(64, 128)
+    with torch.inference_mode():
+        seen = torch.from_numpy(large.transpose(2, 0, 1)[None] / np.float32(127.5) - 1)
+        output = plain.depth_net(seen)[0, 0].numpy()
+    np.testing.assert_allclose(predictor.depth(large), 2 / output, rtol=1e-5)
+    assert predictor.disparity(large).shape == (32, 64)
 
 
 def test_a_prepared_image_gives_the_bytes_of_the_image(predictor: DepthPosePredictor) -> None:

@@ -160,11 +160,9 @@ def test_a_leak_is_reported(job: Any) -> None:
 
 def test_ablation_compares_with_the_same_seed(job: Any) -> None:
     results = results_of(job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
-    text = page.ablation_tables(results)
-    table = cells(text)
+    table = cells(page.ablation_tables(results))
     assert [row[:2] for row in table[1:3]] == [["everything on", "1.00 (1.00)"], ["no loops", "2.00 (4.00)"]]
     assert table[-2:] == [["everything on", "1.50"], ["no loops", "3.00"]]
-    assert "– map triangles, loop 610: no map." in text
 
 
 @pytest.mark.slow

@@ -165,6 +165,11 @@ def test_ablation_compares_with_the_same_seed(job: Any) -> None:
     assert table[-2:] == [["everything on", "1.50"], ["no loops", "3.00"]]
 
 
+def test_a_number_that_is_missing_has_its_reason_below(job: Any) -> None:
+    text = page.maps_tables(results_of(job, {plan.EVERYTHING.name: [1.0]}))
+    assert "– map triangles, loop 610: no map." in text
+
+
 @pytest.mark.slow
 def test_two_checkouts_in_turn(tmp_path: Path) -> None:
     report, here = tmp_path / "page.md", Path(__file__).parents[2]

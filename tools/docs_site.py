@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
+WEIGHTS = "default", "sim", "erf-dfc", "erf-dfcv2", "fusion"
 # files of the repository whose page is not where the file is in docs/
 PLACES = {
     "README.md": "index.md",
@@ -34,7 +35,7 @@ PLACES = {
     "CHANGELOG.md": "changelog.md",
     "docs/README.md": "pages.md",
     "docs/first-steps.ipynb": "first-steps.md",
-    **{f"erfsfm/weights/{name}/README.md": f"weights/{name}.md" for name in ("default", "sim", "erf-dfc", "erf-dfcv2")},
+    **{f"erfsfm/weights/{name}/README.md": f"weights/{name}.md" for name in WEIGHTS},
 }
 SOURCES = {place: source for source, place in PLACES.items()}
 LINK = re.compile(r"\]\((?![a-z]+:|#)([^)\s#]+)")

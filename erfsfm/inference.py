@@ -190,8 +190,8 @@ class DepthPosePredictor:
         (height, width), size = image.shape[:2], self.record.depth_input
         if size is None:
             return depth_at(self.disparity(image), height, width)
-        output = self._networks.depth(self._input(image, size.height, size.width))[0, 0]
-        return depth_at(self._finite(output, "depth") * np.float32(size.disparity), height, width)
+        seen = PreparedImage(self._input(image, size.height, size.width))
+        return depth_at(self.disparity(seen) * np.float32(size.disparity), height, width)
 
     def prepare(self, image: NDArray[np.uint8]) -> PreparedImage:
         """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image."""

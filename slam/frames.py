@@ -86,10 +86,6 @@ class Frame:
         known: T = self._derived[key]
         return known
 
-    def known(self, key: Hashable) -> Any:
-        """What was derived with this key before, or None."""
-        return self._derived.get(key)
-
     @property
     def grey(self) -> Grey:
         """Grey levels ``(H, W)`` uint8."""
@@ -165,8 +161,11 @@ class Predictor(Protocol):
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` of a frame, at the image's size: positive and finite, or NaN where unknown."""
 
-    def snippet(self, frames: list[Frame]) -> SnippetPoses:
-        """Poses of the sources of a snippet whose target is the middle frame."""
+    def snippet(self, frames: list[Frame], with_residuals: bool = True) -> SnippetPoses:
+        """Poses of the sources of a snippet whose target is the middle frame.
+
+        Residuals need the target's depth, which costs as much as the poses where nothing else asks for it.
+        """
 
     def executor(self) -> Executor:
         """A new executor of one thread for this predictor, with its number of cores; the user shuts it down."""

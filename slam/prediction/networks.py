@@ -62,11 +62,8 @@ class NetworkPredictor:
         height, width = frame.image.shape[:2]
         return depth_at(self._disparity(frame), height, width)
 
-    def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
-        """Poses of the sources of a snippet; the target is the middle frame.
-
-        Their residuals are computed where the depth of the target has been.
-        """
+    def snippet(self, frames: Sequence[Frame], with_residuals: bool = True) -> SnippetPoses:
+        """Poses of the sources of a snippet, and their residuals if wanted; the target is the middle frame."""
 
         def compute() -> Answer:
             return (self._networks.poses([self._prepared(frame) for frame in frames]),)
@@ -74,8 +71,9 @@ class NetworkPredictor:
         (T_source_target,) = self._answers("poses", frames, compute)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
-        disparity = frames[middle].known((self._key, "disparity"))
-        residuals = None if disparity is None else self._residuals(frames, disparity, T_source_target)
+        residuals = None
+        if with_residuals:
+            residuals = self._residuals(frames, self._disparity(frames[middle]), T_source_target)
         return SnippetPoses(frames[middle].index, sources, T_source_target, residuals)
 
     def _residuals(

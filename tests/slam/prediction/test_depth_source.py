@@ -30,7 +30,7 @@ class Networks:
     def depth(self, frame: Frame) -> DepthMap:
         return np.asarray(1 / SCENE, np.float32)
 
-    def snippet(self, frames: list[Frame]) -> SnippetPoses:
+    def snippet(self, frames: list[Frame], with_residuals: bool = True) -> SnippetPoses:
         T_source_target = np.tile(np.eye(4), (4, 1, 1))
         T_source_target[:, 2, 3] = 1.0
         indices = [frame.index for frame in frames]

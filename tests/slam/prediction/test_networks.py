@@ -70,13 +70,21 @@ def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredic
     assert poses.residuals is not None and poses.residuals.shape == (4,) and (poses.residuals > 0).all()
 
 
-def test_a_snippet_has_residuals_where_the_depth_of_its_target_is_known(direct: DepthPosePredictor) -> None:
+def test_residuals_are_the_same_whether_the_depth_of_the_target_was_asked_for_before(
+    direct: DepthPosePredictor,
+) -> None:
+    """A run that is continued has read its last frames again: nothing is derived in them yet."""
     predictor, snippet = NetworkPredictor(direct, CAMERA), frames(0)
-    without = predictor.snippet(snippet)
     predictor.depth(snippet[2])
-    known = predictor.snippet(snippet)
-    assert without.residuals is None and known.residuals is not None
-    np.testing.assert_array_equal(without.T_source_target, known.T_source_target)
+    known, read_again = predictor.snippet(snippet), predictor.snippet(again(snippet))
+    assert known.residuals is not None and read_again.residuals is not None
+    np.testing.assert_array_equal(read_again.residuals, known.residuals)
+
+
+def test_a_snippet_without_residuals_asks_for_no_depth() -> None:
+    networks, snippet = Counting(), frames(0)
+    assert NetworkPredictor(networks, CAMERA).snippet(snippet, with_residuals=False).residuals is None
+    assert networks.asked == 1
 
 
 def test_the_executor_is_one_thread_that_ends_with_its_user(direct: DepthPosePredictor) -> None:

@@ -136,6 +136,7 @@ class WeightKeeper(Callback):
             networks=module.known,
             trained_on=self._seen,
             licence=licence_of(self._seen),
+            depth_input=module.depth_input,
             step=step,
             metrics=module.validation_metrics,
             version=erfsfm.__version__,

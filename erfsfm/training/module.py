@@ -21,6 +21,7 @@ from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.geometry.warp import project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.structure import Bounds
+from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
 from erfsfm.networks.presets import NetworkKind
@@ -50,6 +51,7 @@ class SelfSupervision(lightning.LightningModule):
         self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
+        self.depth_input: DepthInput | None = None  # of the network that this training goes on with
         self._choose_trained()
         self.train()  # Lightning keeps the mode of each module
         self.loss = math.nan  # of the latest step
@@ -233,12 +235,15 @@ class SelfSupervision(lightning.LightningModule):
         self._note("snippet_re", errors.re_mean)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Note which networks were trained."""
+        """Note which networks were trained, and the size of single images."""
         checkpoint["known"] = self.known
+        checkpoint["depth_input"] = self.depth_input and self.depth_input.model_dump()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take over which networks were trained."""
+        """Take over which networks were trained, and the size of single images."""
         self.known = checkpoint["known"]
+        depth_input = checkpoint.get("depth_input")
+        self.depth_input = DepthInput.model_validate(depth_input) if depth_input else None
 
     def on_validation_epoch_end(self) -> None:
         """Note and log what the first process measured, by which all of them decide what to keep and when to stop."""

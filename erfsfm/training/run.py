@@ -245,6 +245,8 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
         ) from error
     if model.record.networks != module.known:
         module.known = "both"
+    if (model.record.network.depth, model.record.network.depth_width) == (wanted.depth, wanted.depth_width):
+        module.depth_input = model.record.depth_input
     return model.record.trained_on
 
 

@@ -11,6 +11,7 @@ import pickle
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,7 +32,7 @@ from erfsfm.config import ExperimentConfig, TrainedNetworks, load_experiment
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.model_record import ModelRecord
+from erfsfm.model_record import DepthInput, ModelRecord
 from erfsfm.training.keeper import licence_of
 from erfsfm.training.module import SelfSupervision, decisive, learning_rate_factor
 from erfsfm.training.run import train
@@ -500,10 +501,12 @@ def test_decisive(metrics: dict[str, float], measure: float) -> None:
     assert decisive(metrics) == measure
 
 
-def test_initial_weights_pass_on_their_leak_record(
+def test_initial_weights_pass_on_their_leak_record_and_the_size_of_single_images(
     alone: Configure, small: Small, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = train(alone(training={"steps": 1}), tmp_path / "first", device="cpu")
+    larger, model = DepthInput(height=64, width=208, disparity=0.8), load_model(first)
+    save_model(first, replace(model, record=model.record.model_copy(update={"depth_input": larger})))
     config = configure(small, [held_out], data={"validation": []}).model_copy(update={"initial_weights": str(first)})
     gentle = config.training.model_copy(update={"learning_rate": 1e-12})
     config = config.model_copy(update={"training": gentle})
@@ -511,7 +514,7 @@ def test_initial_weights_pass_on_their_leak_record(
     second = train(config, tmp_path / "second", resume=True, device="cpu")
     record = load_model(second).record
     assert record.trained_on == ["simulated/500", "kitti_odometry/00[0:10]"], "also after a resume"
-    assert record.licence.startswith("CC BY-NC-SA")
+    assert record.licence.startswith("CC BY-NC-SA") and record.depth_input == larger
     for trained, initial in zip(weights_of(second), weights_of(first), strict=True):
         torch.testing.assert_close(trained, initial)
 

@@ -1,4 +1,4 @@
-"""Errors of the many-view teacher's labels against true depth, measured around a network's depth and without one.
+"""Errors of the many-view teacher's labels against true depth: by flow alone, and learned depth refined.
 
 Example: python tools/label_errors.py --dataset worlds/600 --weights default
 """
@@ -16,10 +16,10 @@ from shared.command import one_line_errors, parser_of
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import read_image
 from erfsfm.data.discovery import discover
-from erfsfm.data.many_view_teacher import DriveLabels, Guess, ManyViewTeacher
+from erfsfm.data.many_view_teacher import DriveLabels, Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.evaluation.raw_drives import RawFrame, lidar_depth
-from erfsfm.training.supervision import GuessedDepth
+from erfsfm.training.supervision import LearnedDepth
 
 SIZE = (128, 416)
 SOURCES = 4
@@ -33,7 +33,7 @@ def main() -> None:
     """One line for each recording and kind of label."""
     parser = parser_of(__doc__)
     parser.add_argument("--dataset", type=Path, required=True, help="with true depth, or a drive of KITTI raw")
-    parser.add_argument("--weights", default="default", help="of the poses and of the guessed depth")
+    parser.add_argument("--weights", default="default", help="of the poses and of learned depth")
     arguments = parser.parse_args()
     for recording in discover(arguments.dataset):
         for line in compared(recording, arguments.weights):
@@ -41,13 +41,13 @@ def main() -> None:
 
 
 def compared(recording: Recording, weights: str) -> list[str]:
-    """Labels of a recording at the same poses, without a guess and with one."""
+    """Labels of a recording at the same poses: by flow alone, and learned depth refined."""
     lines = []
     with tempfile.TemporaryDirectory(prefix="erfsfm-labels-") as folder:
         T_world_camera = None
-        guesses: dict[str, Guess | None] = {"plain": None, "guided": GuessedDepth(weights)}
-        for kind, guess in guesses.items():
-            teacher = ManyViewTeacher(Path(folder, kind), SIZE, STRIDE, guess=guess)
+        kinds: dict[str, Learned | None] = {"flow": None, "refined": LearnedDepth(weights)}
+        for kind, learned in kinds.items():
+            teacher = ManyViewTeacher(Path(folder, kind), SIZE, STRIDE, learned=learned)
             drive = teacher.drive(recording)
             if T_world_camera is not None:
                 drive.keep_poses(T_world_camera)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,9 +30,12 @@ from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
 from erfsfm.labels.many_views import NEIGHBOURS, label
+from erfsfm.labels.refined_depth import in_camera_heights, refined_label
 from erfsfm.labels.structure import TeacherStructure
+from erfsfm.mvs.flow import measure
+from erfsfm.mvs.neighbours import neighbours_around
 
-VERSION = 1
+VERSION = 2
 # pixels of the images that are measured: finer flow is slower and no surer; twice the networks' width would shift
 # labels, sampled by nearest, by half a pixel
 LARGEST_WIDTH = 800
@@ -41,7 +44,9 @@ _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
 
 Measures = Literal["depth and poses", "poses"]
-Guess = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
+Grey = NDArray[np.uint8]
+Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]  # least and most inverse depth (H, W)
+Learned = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
 
 
 @dataclass(frozen=True)
@@ -133,33 +138,60 @@ class DriveLabels:
         """Write the poses ``(N, 4, 4)`` of all frames."""
         write_atomically(self.poses_file, lambda path: _save(path, T_world_camera))
 
-    def measure_labels(self, targets: Sequence[int], guess: Guess | None = None) -> int:
-        """Measure and keep the labels of some frames, around a guess of their depth; returns their number.
+    def measure_labels(self, targets: Sequence[int], learned: Learned | None = None) -> int:
+        """Measure and keep the labels of some frames; returns their number.
 
-        Neighbours that cannot be read are left out. Of a frame that cannot be read, or has less than two, nothing is
-        known.
+        They are learned depth refined by neighbours, or what flow measures alone where no depth is learned. Neighbours
+        that cannot be read are left out. Of a frame that cannot be read, or has less than two, nothing is known.
         """
         cv2.setNumThreads(1)
-        ratio = min(LARGEST_WIDTH / self.recording.camera.width, 1)
-        camera = self.recording.camera
-        camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
         for target in targets:
-            near = [n for n in (target + k for k in NEIGHBOURS) if 0 <= n < len(self.recording)]
-            images = {n: image for n in (target, *near) if (image := self._image(n, camera)) is not None}
-            nothing = np.zeros((camera.height, camera.width), np.float32)
-            bounds = nothing, np.full_like(nothing, np.inf)
-            if target in images and len(images) > LEAST_NEIGHBOURS:
-                guessed = None if guess is None else guess(images[target])
-                grey = {n: np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for n, image in images.items()}
-                image = grey.pop(target)
-                T_neighbour_target = np.linalg.inv(self.T_world_camera[[*grey]]) @ self.T_world_camera[target]
-                bounds = label(image, [*grey.values()], camera.K.astype(np.float64), T_neighbour_target, guessed)
+            bounds = self._by_flow(target) if learned is None else self._refined(target, learned)
+            if bounds is None:
+                bounds = np.zeros(self.size, np.float32), np.full(self.size, np.inf, np.float32)
             least, most = (
                 cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
                 for values in bounds
             )
             write_atomically(self.label_file(target), lambda p: _compress(p, least=least, most=most), sync=False)  # noqa: B023
         return len(targets)
+
+    def _by_flow(self, target: int) -> Bounds | None:
+        """Label of a frame at a size at which flow is fine."""
+        ratio = min(LARGEST_WIDTH / self.recording.camera.width, 1)
+        camera = self.recording.camera
+        camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
+        image, around = self._image(target, camera), self._around(target, camera)
+        if image is None or len(around) < LEAST_NEIGHBOURS:
+            return None
+        return label(_grey(image), [*around.values()], camera.K.astype(np.float64), self._motion(target, around))
+
+    def _refined(self, target: int, learned: Learned) -> Bounds | None:
+        """Label of a frame at the labels' size, around its learned depth."""
+        camera = self.recording.camera.resized(self.size[1], self.size[0])
+        image, around, K = self._image(target, camera), self._around(target, camera), camera.K.astype(np.float64)
+        if image is None or len(around) < LEAST_NEIGHBOURS:
+            return None
+        grey = _grey(image)
+        by_flow = measure(grey, [*around.values()], K, self._motion(target, around))
+        inverse_depth = in_camera_heights(learned(image), by_flow)
+        if inverse_depth is None:
+            return None
+        frames = np.arange(len(self.recording))
+        chosen = neighbours_around(self.T_world_camera, target, 1 / float(np.median(inverse_depth)), frames)
+        others = {n: _grey(near) for n in chosen if (near := self._image(n, camera)) is not None}
+        if not others:
+            return None
+        return refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth)
+
+    def _around(self, target: int, camera: Camera) -> dict[int, Grey]:
+        """The frames before and after that can be read."""
+        near = (target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording))
+        return {n: _grey(image) for n in near if (image := self._image(n, camera)) is not None}
+
+    def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
+        """``T_other_target`` ``(N, 4, 4)``."""
+        return np.asarray(np.linalg.inv(self.T_world_camera[[*others]]) @ self.T_world_camera[target])
 
     def _image(self, index: int, camera: Camera) -> NDArray[np.uint8] | None:
         """A frame at a camera's size; None where it cannot be read."""
@@ -191,7 +223,7 @@ class ManyViewTeacher:
         stride: every how many frames there is one.
         cache_mb: memory for labels that were read.
         measures: with ``poses`` alone there are no labels, every frame may be a target, and no depth is bounded.
-        guess: of the depth of an image, around which it is measured; it has to be one that processes can be given.
+        learned: depth of an image, which is refined; it has to be one that processes can be given.
     """
 
     def __init__(
@@ -201,10 +233,10 @@ class ManyViewTeacher:
         stride: int,
         cache_mb: int = 0,
         measures: Measures = "depth and poses",
-        guess: Guess | None = None,
+        learned: Learned | None = None,
     ) -> None:
         self.measures = measures
-        self._guess = guess
+        self._learned = learned
         self._folder = folder
         self._size = size
         self._stride = stride if measures == "depth and poses" else 1
@@ -254,14 +286,14 @@ class ManyViewTeacher:
         total, done = sum(len(chunk) for _, chunk in tasks), 0
         if not tasks:
             return
-        if len(tasks) == 1 and self._guess is None:  # a process would take longer to start
+        if len(tasks) == 1 and self._learned is None:  # a process would take longer to start
             ((drive, chunk),) = tasks
             with limit_library_threads():
                 progress("teacher: depth", drive.measure_labels(chunk), total)
             return
         with processes("measures labels") as pool:
             running: list[Future[int]] = [
-                pool.submit(drive.measure_labels, chunk, self._guess) for drive, chunk in tasks
+                pool.submit(drive.measure_labels, chunk, self._learned) for drive, chunk in tasks
             ]
             for future in as_completed(running):
                 done += future.result()
@@ -289,6 +321,10 @@ def _missing(drive: DriveLabels, sources: int) -> Iterator[list[int]]:
     frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
     for first in range(0, len(frames), _CHUNK):
         yield frames[first : first + _CHUNK]
+
+
+def _grey(image: NDArray[np.uint8]) -> Grey:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _save(path: Path, array: NDArray[Any]) -> None:

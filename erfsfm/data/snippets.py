@@ -21,7 +21,7 @@ from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
 from erfsfm.data.exact_depth import ExactImages, by_label
-from erfsfm.data.many_view_teacher import Guess, ManyViewTeacher
+from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, depth_alone, single_image, training_sample
 from erfsfm.data.split_file import Split, read_split_file
@@ -47,7 +47,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         first_draw: int = 0,
         rank: int = 0,
         many_views: ManyViewTeacher | None = None,
-        imitated: Guess | None = None,
+        imitated: Learned | None = None,
     ) -> None:
         self._config = config
         self._draws = draws

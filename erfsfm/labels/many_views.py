@@ -1,4 +1,4 @@
-"""Depth of one image from many neighbours at the poses of the SLAM system, as pseudo-labels without labels.
+"""Depth of one image from many neighbours at the poses of the SLAM system: measured by flow, without any network.
 
 Lengths are in heights of the camera over the road.
 """
@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.labels.road import impose_road, road_plane
-from erfsfm.mvs.flow import Array, Grey, MeasuredDepth, measure, rays
+from erfsfm.mvs.flow import Array, Grey, measure, rays
 
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)  # frames
 MIN_SNR = 5.0  # inverse depth over its sigma
-LEAST_KNOWN = 500  # pixels
 LEAST_SIGMA = 0.01  # of the inverse depth: no label is surer, for the poses are not
 LEAST_TRAVEL = 0.1  # camera heights between the first and the last neighbour
 SKY_BRIGHTNESS = 0.95  # of the brightest pixels of the upper half
@@ -31,7 +30,6 @@ def label(
     neighbours: Sequence[Grey],
     K: NDArray[np.floating],
     T_neighbour_target: NDArray[np.float64],
-    guess: Array | None = None,
 ) -> tuple[Array, Array]:
     """Least and most inverse depth of each pixel ``(H, W)``, in one over camera heights; 0 and infinite if unknown.
 
@@ -43,11 +41,8 @@ def label(
         neighbours: N images of the same camera, earlier ones first.
         K: camera matrix of these images.
         T_neighbour_target: ``(N, 4, 4)``, translations in camera heights.
-        guess: of the inverse depth ``(H, W)``, positive, in any unit.
     """
-    if guess is not None:
-        guess = _in_camera_heights(guess, measure(target, neighbours, K, T_neighbour_target))
-    measured = measure(target, neighbours, K, T_neighbour_target, fine=True, guess=guess)
+    measured = measure(target, neighbours, K, T_neighbour_target, fine=True)
     inverse_depth, sigma = measured.inverse_depth, measured.sigma
     at_least = np.zeros_like(inverse_depth)
     reliable = inverse_depth > MIN_SNR * sigma
@@ -63,14 +58,6 @@ def label(
     sky = sky_mask(target, (float(K[0, 2]), float(K[1, 2])))
     least[sky], most[sky] = 0, SKY_INVERSE_DEPTH
     return least.astype(np.float32), most.astype(np.float32)
-
-
-def _in_camera_heights(guess: Array, measured: MeasuredDepth) -> Array | None:
-    """The guess scaled to what is known without it; None where too little is."""
-    known = measured.inverse_depth > MIN_SNR * measured.sigma
-    if known.sum() < LEAST_KNOWN:
-        return None
-    return guess * np.float32(np.median(measured.inverse_depth[known] / guess[known]))
 
 
 def direction_of_travel(T_neighbour_target: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -2,8 +2,6 @@
 
 Dense inverse search flow (Kroeger et al. 2016) to each neighbour, checked forwards and backwards, gives the inverse
 depth whose projection lies nearest to the flow's end point; the neighbours' answers are averaged where they agree.
-With a guess of the depth the neighbours are first brought to the target's view by it, and flow is what is left: what
-lies near then moves by a few pixels instead of tens, and what moves by itself agrees with no depth.
 """
 
 from __future__ import annotations
@@ -14,8 +12,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from erfsfm.mvs.projection import Projection
 
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float32]
@@ -41,7 +37,6 @@ def measure(
     K: NDArray[np.floating],
     T_neighbour_target: NDArray[np.float64],
     fine: bool = False,
-    guess: Array | None = None,
 ) -> MeasuredDepth:
     """Inverse depth of the target's pixels where at least two neighbours agree.
 
@@ -51,16 +46,10 @@ def measure(
         K: camera matrix ``(3, 3)`` of these images.
         T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
         fine: flow down to single pixels, four times as slow.
-        guess: of the inverse depth ``(H, W)``, positive, in the unit of the poses.
     """
     values, sigmas = [], []
     for image, T in zip(neighbours, T_neighbour_target):
-        if guess is None:
-            flow, trusted = optical_flow(target, image, fine)
-        else:
-            flow, trusted = guided_flow(
-                target, image, fine, np.dstack(Projection(K, T, *target.shape).pixels(guess)[:2])
-            )
+        flow, trusted = optical_flow(target, image, fine)
         d, sigma, off_line_px = triangulate(flow, T, K)
         sigma[~trusted | (off_line_px > OFF_LINE_PX)] = np.inf
         values.append(d)
@@ -105,17 +94,6 @@ def optical_flow(first: Grey, second: Grey, fine: bool) -> tuple[Array, NDArray[
         back, u + there[..., 0], v + there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1e3
     )
     return there, np.linalg.norm(there + back_there, axis=-1) < ROUND_TRIP_PX
-
-
-def guided_flow(first: Grey, second: Grey, fine: bool, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """As `optical_flow`, searched around the given pixels ``(H, W, 2)`` of the second image."""
-    near = cv2.remap(second, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    left, trusted = optical_flow(first, np.asarray(near, np.uint8), fine)
-    height, width = first.shape
-    v, u = np.mgrid[:height, :width].astype(np.float32)
-    ends = cv2.remap(pixels, u + left[..., 0], v + left[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inside = (ends >= 0).all(axis=-1) & (ends[..., 0] <= width - 1) & (ends[..., 1] <= height - 1)
-    return ends - np.stack([u, v], axis=-1), trusted & inside
 
 
 def triangulate(

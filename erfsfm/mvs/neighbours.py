@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 BASELINES = (0.07, 0.2)  # wanted distances over the median depth
 _RANGE = 2.5  # accepted factor on these
 _LARGEST_TURN_DEG = 20.0
+MOST_NEIGHBOURS = 3
+MAX_FRAMES_APART = 40
 
 
 def neighbours(T_world_camera: NDArray[np.float64], target: int, wanted: Iterable[float]) -> list[int]:
@@ -34,3 +36,22 @@ def neighbours(T_world_camera: NDArray[np.float64], target: int, wanted: Iterabl
             chosen.append(int(np.where(possible, off, np.inf).argmin()))
             usable[chosen[-1]] = False
     return chosen
+
+
+def neighbours_around(
+    T_world_camera: NDArray[np.float64], target: int, median_depth: float, frames: Sequence[int] | NDArray[np.int64]
+) -> list[int]:
+    """The views that refine the depth of one, in time order: the best at each distance of ``BASELINES``, three at most.
+
+    Those after come first, for they are nearer to what is ahead.
+
+    Args:
+        T_world_camera: poses ``(N, 4, 4)`` in time order.
+        target: row of the view.
+        median_depth: of it, in the unit of the poses.
+        frames: number of each view's frame ``(N,)``, ascending: those too far away in time are left out.
+    """
+    near = np.flatnonzero(np.abs(np.asarray(frames) - frames[target]) <= MAX_FRAMES_APART)
+    wanted = [sign * baseline * median_depth for sign in (1, -1) for baseline in BASELINES]
+    chosen = neighbours(T_world_camera[near], target - int(near[0]), wanted)
+    return sorted(int(near[row]) for row in chosen[:MOST_NEIGHBOURS])

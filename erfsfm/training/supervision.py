@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import ConfigError
 from erfsfm.common.progress import Progress
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.many_view_teacher import Guess, ManyViewTeacher, Measures
+from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher, Measures
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
 from erfsfm.inference import DepthPosePredictor
@@ -20,7 +20,7 @@ from erfsfm.model_record import find_weights, read_record
 
 
 @dataclass(frozen=True)
-class GuessedDepth:
+class LearnedDepth:
     """Inverse depth of images by the networks whose poses the teacher uses."""
 
     weights: str
@@ -36,9 +36,9 @@ def _predictor(weights: str) -> DepthPosePredictor:
     return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
 
 
-def imitated(config: ExperimentConfig) -> Guess | None:
+def imitated(config: ExperimentConfig) -> Learned | None:
     """Inverse depth in network units as the reference camera would see it, by the network that is imitated, if any."""
-    return GuessedDepth(config.teacher.slam_weights) if config.teacher.views == "network" else None
+    return LearnedDepth(config.teacher.slam_weights) if config.teacher.views == "network" else None
 
 
 def seen_by_imitated(config: ExperimentConfig) -> list[str]:
@@ -73,7 +73,7 @@ def measured_views(
     size = (config.network.height, config.network.width)
     measures: Measures = "poses" if config.training.networks == "pose" else "depth and poses"
     cache_mb = labels_mb(config.data)
-    guess = GuessedDepth(config.teacher.slam_weights)
-    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, measures, guess)
+    learned = LearnedDepth(config.teacher.slam_weights)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, measures, learned)
     teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, progress)
     return teacher

@@ -11,14 +11,12 @@ from scipy.ndimage import distance_transform_edt
 
 from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.neighbours import BASELINES, neighbours
+from erfsfm.mvs.neighbours import neighbours_around
 from erfsfm.mvs.refine import Decide, RefinedDepth, Road, by_rules, measure
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 
-MOST_NEIGHBOURS = 3
-MAX_FRAMES_APART = 40
 _REMEMBERED = 24
 
 
@@ -68,7 +66,7 @@ class DepthRefiner:
         unknown = ~(np.isfinite(depth) & (depth > 0))
         if unknown.all():
             return None
-        chosen = self._neighbours(n, float(np.median(depth[~unknown])))
+        chosen = neighbours_around(self._T_world_camera, n, float(np.median(depth[~unknown])), self._indices)
         if not chosen:
             return None
         if unknown.any():
@@ -80,13 +78,6 @@ class DepthRefiner:
         refined = self._decide(measurement, road)
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
         return refined
-
-    def _neighbours(self, n: int, median_depth: float) -> list[int]:
-        """The best keyframe at each wanted distance, at most three; those after are nearer to what is ahead."""
-        near = np.flatnonzero(np.abs(self._indices - self._indices[n]) <= MAX_FRAMES_APART)
-        wanted = [sign * baseline * median_depth for sign in (1, -1) for baseline in BASELINES]
-        chosen = neighbours(self._T_world_camera[near], n - int(near[0]), wanted)
-        return sorted(int(near[row]) for row in chosen[:MOST_NEIGHBOURS])
 
 
 def _appearance(image: Image) -> Appearance:

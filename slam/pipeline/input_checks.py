@@ -41,9 +41,7 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
             "choose scale.mode=lidar or give a camera height"
         )
     if mode == "reference" and sequence.reference is None:
-        raise SlamError(
-            f"scale mode reference needs true poses; {sequence.name} has none: choose another scale.mode"
-        )
+        raise SlamError(f"scale mode reference needs true poses; {sequence.name} has none: choose another scale.mode")
     if mode == "camera-height" and sequence.camera_height_m is None:
         raise SlamError(
             f"scale mode camera-height needs a known height; {sequence.name} has none: give a camera.yaml "
@@ -53,8 +51,7 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
         raise SlamError("scale mode gps needs a GPS track: give --gps FILE or choose another scale.mode")
     if mode == "known" and grows:
         raise SlamError(
-            f"scale mode known needs frames of a whole sequence, and {sequence.name} grows: "
-            "choose another scale.mode"
+            f"scale mode known needs frames of a whole sequence, and {sequence.name} grows: choose another scale.mode"
         )
     if mode == "known":
         known_frames(config.scale, sequence.stamps)

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 from threading import Thread
 
+import cv2
 import numpy as np
 import pytest
 
@@ -24,7 +25,7 @@ SIZE = (64, 208)
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     root = tmp_path_factory.mktemp("world")
-    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 28, 704, 312, 96)), root / "world")
+    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 28, 704, 312, 96)), root / "world", depth=True)
     return discover(root / "world")[0]
 
 
@@ -118,6 +119,26 @@ def test_an_image_that_cannot_be_read_has_no_label_and_is_no_neighbour(recording
     least, most = drive.label(12)
     assert (least == 0).all() and np.isinf(most).all()
     assert (drive.label(10)[0] > 0).mean() > 0.3
+
+
+def test_learned_depth_is_refined_around_a_frame_at_the_size_of_the_labels(recording, teacher, tmp_path):
+    asked = []
+
+    def learned(image):
+        asked.append(image.shape)
+        rows = np.maximum(np.arange(SIZE[0], dtype=np.float32) - SIZE[0] * 0.45, 2)  # a level road
+        return np.repeat(rows[:, None], SIZE[1], axis=1)
+
+    drive = ManyViewTeacher(tmp_path, SIZE, stride=6).drive(recording)
+    drive.keep_poses(teacher.drive(recording).T_world_camera)
+    assert drive.measure_labels([12], learned) == 1 and asked == [(*SIZE, 3)]
+    least, most = (bound.astype(np.float32) for bound in drive.label(12))
+    narrow = (least > 0) & (most < 1.5 * least)
+    true = cv2.resize(recording.true_depth(12), SIZE[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    both = narrow & (true > 0)
+    assert both.mean() > 0.3
+    ratio = np.sqrt(least[both] * most[both]) * true[both] / 1.65
+    assert abs(np.median(ratio) - 1) < 0.1 and np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.06
 
 
 def test_only_labelled_frames_are_drawn(recording, teacher):

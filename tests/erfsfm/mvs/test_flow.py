@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from erfsfm.mvs.flow import combine, guided_flow, measure, rays, triangulate
-from erfsfm.mvs.projection import Projection
+from erfsfm.mvs.flow import combine, measure, rays, triangulate
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -30,20 +29,6 @@ def test_depth_is_metric_and_its_sigma_tells_where_it_is_known(street, index):
     assert known.mean() > 0.3
     error = np.abs(seen.inverse_depth[known] * truth[known] - 1)
     assert np.median(error) < 0.04
-
-
-@pytest.mark.parametrize("shift", [None, (3.0, -2.0)], ids=["where it is", "beside it"])
-def test_flow_around_predicted_pixels_is_the_flow_itself(street, shift):
-    first, second = (street.render(k).image[..., 1].copy() for k in (120, 124))
-    T = np.linalg.inv(street.T_world_camera[124]) @ street.T_world_camera[120]
-    depth = street.render(120).depth
-    inverse = (1 / np.where(depth > 0, depth, 1e3)).astype(np.float32)
-    exact = np.dstack(Projection(street.K, T, *depth.shape).pixels(inverse)[:2])
-    pixels = exact if shift is None else exact + np.float32(shift)
-    flow, trusted = guided_flow(first, second, True, pixels)
-    v, u = np.mgrid[:128, :416].astype(np.float32)
-    error = np.linalg.norm(flow - (exact - np.stack([u, v], axis=-1)), axis=-1)
-    assert trusted.mean() > 0.3 and np.median(error[trusted & (depth > 0)]) < 0.3
 
 
 def test_wrong_poses_leave_little_that_seems_known(street):

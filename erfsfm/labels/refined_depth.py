@@ -1,0 +1,71 @@
+"""Learned depth of one image, refined by its neighbours at the poses of the SLAM system, as pseudo-labels.
+
+Lengths are in heights of the camera over the road.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.labels.many_views import MIN_SNR, SKY_INVERSE_DEPTH, sky_mask
+from erfsfm.mvs.appearance import Appearance
+from erfsfm.mvs.flow import Array, Grey, MeasuredDepth
+from erfsfm.mvs.fusion import DepthFusion
+from erfsfm.mvs.refine import measure
+
+SIGMAS = 1.645  # of the bounds: nine of ten errors lie between them
+LEAST_KNOWN = 500  # pixels
+_MOST_SIGMA = 0.9  # beyond which nothing is known
+
+
+def refined_label(
+    target: Grey,
+    neighbours: Sequence[Grey],
+    K: NDArray[np.floating],
+    T_neighbour_target: NDArray[np.float64],
+    learned: Array,
+) -> tuple[Array, Array]:
+    """Least and most inverse depth of each pixel ``(H, W)``, in one over camera heights; 0 and infinite if unknown.
+
+    The shipped fusion network decides between the learned depth and what the neighbours measure, and how sure it is.
+    The sky is bounded from above.
+
+    Args:
+        target: grey image ``(H, W)``.
+        neighbours: N images of the same camera.
+        K: camera matrix of these images.
+        T_neighbour_target: ``(N, 4, 4)``, translations in camera heights.
+        learned: inverse depth ``(H, W)`` by a network, in one over camera heights.
+    """
+    others = [Appearance.of(each) for each in neighbours]
+    image, depth = Appearance.of(target), np.asarray(1 / learned, np.float32)
+    measured = measure(image, depth, others, K, T_neighbour_target)
+    if measured.measured.any():  # the unit of learned depth differs from frame to frame
+        depth *= np.float32(np.exp(-np.median(measured.change[measured.measured])))
+        measured = measure(image, depth, others, K, T_neighbour_target)
+    refined = _fusion().decide(measured)
+    inverse_depth, half = 1 / refined.depth, SIGMAS * refined.relative_sigma
+    known = refined.relative_sigma < _MOST_SIGMA
+    least = np.where(known, inverse_depth * np.exp(-half), 0)
+    most = np.where(known, inverse_depth * np.exp(half), np.inf)
+    sky = (inverse_depth < SKY_INVERSE_DEPTH) | sky_mask(target, (float(K[0, 2]), float(K[1, 2])))
+    least[sky], most[sky] = 0, SKY_INVERSE_DEPTH
+    return least.astype(np.float32), most.astype(np.float32)
+
+
+def in_camera_heights(learned: Array, measured: MeasuredDepth) -> Array | None:
+    """Inverse depth ``(H, W)`` of any unit scaled to what is measured without it; None where too little is."""
+    known = measured.inverse_depth > MIN_SNR * measured.sigma
+    if known.sum() < LEAST_KNOWN:
+        return None
+    return learned * np.float32(np.median(measured.inverse_depth[known] / learned[known]))
+
+
+@lru_cache(maxsize=1)
+def _fusion() -> DepthFusion:
+    """In this process."""
+    return DepthFusion("default")

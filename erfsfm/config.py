@@ -139,8 +139,8 @@ class TeacherConfig(Section):
 
     views: Literal["two", "many", "network"] = Field(
         default="two",
-        description="two: each snippet by itself; many: poses by the SLAM system, depth from six neighbours; network: "
-        "the depth of the network of slam_weights, which is imitated",
+        description="two: each snippet by itself; many: poses by the SLAM system, learned depth refined by neighbours; "
+        "network: the depth of the network of slam_weights, which is imitated",
     )
     stride: int = Field(default=2, ge=1, description="every how many frames a label is measured under many views")
     slam_weights: str = Field(
@@ -153,6 +153,9 @@ class TeacherConfig(Section):
         default=0.0, ge=0, description="weight of the translation error, in the depth's unit"
     )
     structure_weight: float = Field(default=0.0, ge=0, description="weight of the depth error up to a scale per image")
+    relative_weight: float = Field(
+        default=0.0, ge=0, description="weight of the mean relative error of depth, up to a scale per image"
+    )
     unit_weight: float = Field(
         default=0.0,
         ge=0,
@@ -177,6 +180,7 @@ class TeacherConfig(Section):
             "rotation": self.rotation_weight,
             "translation": self.translation_weight,
             "structure": self.structure_weight,
+            "relative": self.relative_weight,
             "unit": self.unit_weight,
             "edge": self.edge_weight,
         }

@@ -30,6 +30,7 @@ Event = Literal["map begun", "lost", "relocalised", "map joined"]  # of the trac
 Ends = tuple[int, int]  # the two frames of a step or a factor
 LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may drop these
 KEYFRAME_SOURCE = "window"  # in metrics.json
+_TRUSTED_HEIGHTS = 30.0  # largest learned depth that is used, in camera heights
 _SURFACE_STEP = 0.12  # relative depth step between neighbouring pixels of one surface
 _TIE_PX = np.float32(1e-3)  # of two pixels equally near that right and below, on a road the nearer one
 
@@ -301,6 +302,11 @@ def nearest_depth(depth: DepthMap, pixels: NDArray[np.floating[Any]]) -> FloatAr
     """Depth ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``, NaN where it is unknown."""
     found = nearest(depth, pixels).astype(np.float64)
     return np.where(np.isfinite(found) & (found > 0), found, np.nan)
+
+
+def trusted_depth(depth: FloatArray, height: float | None) -> FloatArray:
+    """Learned depth with NaN where it lies beyond 30 camera heights; ``height`` has the same unit, None is unknown."""
+    return depth if height is None else np.where(depth < _TRUSTED_HEIGHTS * height, depth, np.nan)
 
 
 def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32]) -> DepthMap:

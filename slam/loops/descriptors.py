@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View, nearest_depth
+from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View, nearest_depth, trusted_depth
 
 _CELL_PX = 32
 _DETECTED_PER_KEPT = 4
 _EDGE_PX = 16
 _CORNER_CONTRAST = 10  # least contrast of a corner, grey levels
-_MAX_DEPTH_HEIGHTS = 30.0  # largest depth used, in camera heights
 _MAX_FEATURES = 500  # largest number of corners kept of a frame
 
 
@@ -36,13 +35,11 @@ class FeatureExtractor:
         Args:
             frame: the frame, at the size of the intrinsics.
             depth_unscaled: its learned z-depth ``(H, W)``.
-            height_unscaled: camera height in the same unit; where known, depths of more than
-                30 times as much are not trusted.
+            height_unscaled: camera height in the same unit (see `trusted_depth`).
         """
         pixels, descriptors = self.corners(frame.grey)
-        z = nearest_depth(depth_unscaled, pixels)
-        farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
-        points = self._intrinsics.rays(pixels) * np.where(z < farthest, z, np.nan)[:, None]
+        z = trusted_depth(nearest_depth(depth_unscaled, pixels), height_unscaled)
+        points = self._intrinsics.rays(pixels) * z[:, None]
         return View(frame.index, pixels, descriptors, points.astype(np.float32))
 
     def corners(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:

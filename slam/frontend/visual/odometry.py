@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, nearest_depth
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, nearest_depth, trusted_depth
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
@@ -57,7 +57,6 @@ _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a standing camera and of PnP
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
-_MAX_DEPTH_HEIGHTS = 30.0  # largest depth used, in camera heights
 _ROAD_TOLERANCE = 0.2  # largest deviation of a corner on the road from the camera's height, in camera heights
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
@@ -136,7 +135,7 @@ class VisualOdometry:
             measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
         else:
             learned = nearest_depth(depth_previous_unscaled, tracks.previous)
-            depth = self._trusted(learned, height_unscaled)
+            depth = trusted_depth(learned, height_unscaled)
             ends = (previous.index, current.index)
             measured = (
                 self._still(ends, tracks, depth)
@@ -203,11 +202,6 @@ class VisualOdometry:
         known = UnitRelativePose.of(last.relative_pose.T_from_to)
         return None if known is None else PredictedFlow(*known, depth_previous, self._intrinsics)
 
-    def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
-        """Depths ``(M,)`` with NaN where not trusted."""
-        farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
-        return np.where(depth < farthest, depth, np.nan)
-
     def _matches(
         self, tracks: Tracks, learned: FloatArray, height: float | None, mask: DynamicMask, error: DepthError
     ) -> Matches:
@@ -246,7 +240,7 @@ class VisualOdometry:
             two_view = self._two_views.estimate(corners, before)
             if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
                 return None
-            return self._triangulated(ends, seconds, tracks, corners, self._trusted(learned, height), two_view)
+            return self._triangulated(ends, seconds, tracks, corners, trusted_depth(learned, height), two_view)
 
         usual = step(matches, history)
         if usual is None:

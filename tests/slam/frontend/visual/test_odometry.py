@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from slam import frames
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.visual import odometry
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.step_noise import StepNoise
@@ -150,7 +150,7 @@ def test_failures_carry_a_reason(texture):
 
 
 def test_far_depth_is_not_trusted(texture, monkeypatch):
-    monkeypatch.setattr(odometry, "_MAX_DEPTH_HEIGHTS", 0.5)
+    monkeypatch.setattr(frames, "_TRUSTED_HEIGHTS", 0.5)
     forward = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     failure = measure(forward, texture)
     assert isinstance(failure, MeasurementFailure)

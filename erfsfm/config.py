@@ -153,9 +153,6 @@ class TeacherConfig(Section):
         default=0.0, ge=0, description="weight of the translation error, in the depth's unit"
     )
     structure_weight: float = Field(default=0.0, ge=0, description="weight of the depth error up to a scale per image")
-    relative_weight: float = Field(
-        default=0.0, ge=0, description="weight of the mean relative error of depth, up to a scale per image"
-    )
     unit_weight: float = Field(
         default=0.0,
         ge=0,
@@ -180,7 +177,6 @@ class TeacherConfig(Section):
             "rotation": self.rotation_weight,
             "translation": self.translation_weight,
             "structure": self.structure_weight,
-            "relative": self.relative_weight,
             "unit": self.unit_weight,
             "edge": self.edge_weight,
         }

@@ -12,7 +12,6 @@ MAX_BOUND_RATIO = 1.5  # most over least
 FARTHEST = 100.0  # camera heights: weights do not grow beyond
 STEPS_PX = (1, 2, 4, 8)
 LEAST_HALF_WIDTH = 1e-3  # of bounds, log inverse depth: those of exact depth have none
-LARGEST_LOG_ERROR = 1.0  # beyond which the relative error grows no faster than the error of log depth
 STILL = 0.01  # network units: added to the length of a step, against division by zero
 
 
@@ -71,25 +70,6 @@ def disagreement(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor
     nearest = torch.where(has_most, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
     weight = torch.where(has_most | has_least, nearest.rsqrt(), 0)
     mean: Tensor = (weight * torch.where(both, huber, one_sided)).sum() / weight.sum().clamp(min=1)
-    return mean
-
-
-def relative_error(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
-    """Mean of ``|depth / measured - 1|`` over pixels with narrow bounds.
-
-    The error of log depth counts a post that is taken for its background, and background for a post, alike. This one
-    counts the first more, and all distances alike.
-
-    Args:
-        disparity: inverse depth ``(B, 1, H, W)``, positive.
-        bounds: of the same size.
-        log_scale: log of the disparity's scale over that of the bounds, ``(B, 1, 1, 1)``.
-    """
-    narrow = (bounds.least > 0) & (bounds.most < MAX_BOUND_RATIO * bounds.least)
-    middle = torch.where(narrow, (bounds.least * bounds.most).sqrt(), 1)
-    farther = middle.log() - disparity.log() + log_scale
-    error = (farther.clamp(max=LARGEST_LOG_ERROR).exp() - 1).abs() + (farther - LARGEST_LOG_ERROR).clamp(min=0)
-    mean: Tensor = torch.where(narrow, error, 0).sum() / narrow.sum().clamp(min=1)
     return mean
 
 

@@ -22,7 +22,6 @@ from erfsfm.losses.structure import (
     Bounds,
     disagreement,
     enlarged,
-    relative_error,
     rotation_disagreement,
     step_disagreement,
     translation_disagreement,
@@ -134,7 +133,7 @@ class _Prediction:
 def needs_depth(config: ExperimentConfig) -> bool:
     """Whether any term of the loss depends on the depth network."""
     loss, teacher = config.loss, config.teacher
-    by_teacher = teacher.structure_weight + teacher.relative_weight + teacher.edge_weight + teacher.unit_weight
+    by_teacher = teacher.structure_weight + teacher.edge_weight + teacher.unit_weight
     two_view_lengths = teacher.translation_weight if teacher.views == "two" else 0
     weights = loss.photometric_weight + loss.smoothness_weight + by_teacher + two_view_lengths
     return config.training.networks != "pose" and weights > 0
@@ -215,8 +214,6 @@ def _teacher_terms(
         height, width = bounds.least.shape[-2:]
         levels = [enlarged(disparities[k], k, (height, width)) for k in range(config.loss.scales)]
         terms["structure"] = torch.stack([disagreement(level, bounds, unit) for level in levels]).mean()
-        if config.teacher.relative_weight > 0:
-            terms["relative"] = torch.stack([relative_error(level, bounds, unit) for level in levels]).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)
     if needs_poses(config) and T_measured is not None:

@@ -458,7 +458,9 @@ def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path:
     command = [sys.executable, "-m", "slam", "live", "--camera", str(target), "--output", str(output), "--wait", "600"]
     command += ["--calibration", str(street / "camera.yaml")]
     command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    heeded = partial(signal.signal, number, signal.SIG_DFL)  # what a shell runs in the background ignores ctrl-C
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heeded) as process:
         assert process.stdout is not None
         for _ in range(FRAMES):
             messages.append(json.loads(process.stdout.readline()))

@@ -86,17 +86,13 @@ def main() -> None:
 
 
 def averaged(model: Model, other: Model) -> Model:
-    """Networks with the mean of both weights (Wortsman et al. 2022, robust fine-tuning).
-
-    They see images at the size of the others, which they began from.
-    """
+    """Networks with the mean of both weights (Wortsman et al. 2022, robust fine-tuning)."""
     for network, start in ((model.depth_net, other.depth_net), (model.pose_net, other.pose_net)):
         state = start.state_dict()
         mean = {k: (v + state[k]) / 2 if v.is_floating_point() else v for k, v in network.state_dict().items()}
         network.load_state_dict(mean)
     seen = merge([*model.record.trained_on, *other.record.trained_on])
-    size = {"network": other.record.network, "depth_input": other.record.depth_input}
-    return Model(model.record.model_copy(update={"trained_on": seen} | size), model.depth_net, model.pose_net)
+    return Model(model.record.model_copy(update={"trained_on": seen}), model.depth_net, model.pose_net)
 
 
 def _table(path: Path | None, fallback: dict[str, float]) -> str:

@@ -32,7 +32,7 @@ from erfsfm.labels.drive_poses import drive_poses
 from erfsfm.labels.many_views import NEIGHBOURS, label
 from erfsfm.labels.refined_depth import in_camera_heights, refined_label
 from erfsfm.labels.structure import TeacherStructure
-from erfsfm.mvs.flow import measure
+from erfsfm.mvs.flow import Grey, measure
 from erfsfm.mvs.neighbours import neighbours_around
 
 VERSION = 2
@@ -44,7 +44,6 @@ _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
 
 Measures = Literal["depth and poses", "poses"]
-Grey = NDArray[np.uint8]
 Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]  # least and most inverse depth (H, W)
 Learned = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
 
@@ -161,7 +160,7 @@ class DriveLabels:
         ratio = min(LARGEST_WIDTH / self.recording.camera.width, 1)
         camera = self.recording.camera
         camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
-        image, around = self._image(target, camera), self._around(target, camera)
+        image, around = self._image(target, camera), self._greys(self._around(target), camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
         return label(_grey(image), [*around.values()], camera.K.astype(np.float64), self._motion(target, around))
@@ -169,25 +168,29 @@ class DriveLabels:
     def _refined(self, target: int, learned: Learned) -> Bounds | None:
         """Label of a frame at the labels' size, around its learned depth."""
         camera = self.recording.camera.resized(self.size[1], self.size[0])
-        image, around, K = self._image(target, camera), self._around(target, camera), camera.K.astype(np.float64)
+        image, around = self._image(target, camera), self._greys(self._around(target), camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
-        grey = _grey(image)
+        grey, K = _grey(image), camera.K.astype(np.float64)
         by_flow = measure(grey, [*around.values()], K, self._motion(target, around))
         inverse_depth = in_camera_heights(learned(image), by_flow)
         if inverse_depth is None:
             return None
         frames = np.arange(len(self.recording))
         chosen = neighbours_around(self.T_world_camera, target, 1 / float(np.median(inverse_depth)), frames)
-        others = {n: _grey(near) for n in chosen if (near := self._image(n, camera)) is not None}
+        known = around | self._greys([n for n in chosen if n not in around], camera)
+        others = {n: known[n] for n in chosen if n in known}
         if not others:
             return None
         return refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth)
 
-    def _around(self, target: int, camera: Camera) -> dict[int, Grey]:
-        """The frames before and after that can be read."""
-        near = (target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording))
-        return {n: _grey(image) for n in near if (image := self._image(n, camera)) is not None}
+    def _around(self, target: int) -> list[int]:
+        """Frames before and after."""
+        return [target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording)]
+
+    def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
+        """Those frames that can be read."""
+        return {n: _grey(image) for n in frames if (image := self._image(n, camera)) is not None}
 
     def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
         """``T_other_target`` ``(N, 4, 4)``."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 BASELINES = (0.07, 0.2)  # wanted distances over the median depth
 _RANGE = 2.5  # accepted factor on these
 _LARGEST_TURN_DEG = 20.0
-MOST_NEIGHBOURS = 3
-MAX_FRAMES_APART = 40
+_MOST_NEIGHBOURS = 3
+_MAX_FRAMES_APART = 40
 
 
 def neighbours(T_world_camera: NDArray[np.float64], target: int, wanted: Iterable[float]) -> list[int]:
@@ -51,7 +51,7 @@ def neighbours_around(
         median_depth: of it, in the unit of the poses.
         frames: number of each view's frame ``(N,)``, ascending: those too far away in time are left out.
     """
-    near = np.flatnonzero(np.abs(np.asarray(frames) - frames[target]) <= MAX_FRAMES_APART)
+    near = np.flatnonzero(np.abs(np.asarray(frames) - frames[target]) <= _MAX_FRAMES_APART)
     wanted = [sign * baseline * median_depth for sign in (1, -1) for baseline in BASELINES]
     chosen = neighbours(T_world_camera[near], target - int(near[0]), wanted)
-    return sorted(int(near[row]) for row in chosen[:MOST_NEIGHBOURS])
+    return sorted(int(near[row]) for row in chosen[:_MOST_NEIGHBOURS])

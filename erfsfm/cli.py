@@ -15,7 +15,7 @@ import typer
 from erfsfm import __version__
 from erfsfm.cli_evaluate import evaluate_app
 from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights, print_rows
-from erfsfm.cli_train import pack, train, train_fusion
+from erfsfm.cli_train import train, train_fusion
 from erfsfm.common import command_line
 
 logger = logging.getLogger(__name__)
@@ -29,7 +29,6 @@ app = typer.Typer(
 app.add_typer(evaluate_app, name="evaluate")
 app.command()(train)
 app.command("train-fusion")(train_fusion)
-app.command()(pack)
 
 
 def _print_version(wanted: bool) -> None:
@@ -110,7 +109,7 @@ def predict(
 def networks(
     fidelity: Fidelity = "default",
     width: Annotated[float, typer.Option(help="multiplies the channels")] = 1.0,
-    sources: Annotated[int, typer.Option(help="source frames of the pose networks")] = 4,
+    sources: Annotated[int, typer.Option(min=1, max=8, help="source frames of the pose networks")] = 4,
     as_json: Json = False,
 ) -> None:
     """Every network: parameters, multiply-adds at 416x128, receptive field.

@@ -1,4 +1,4 @@
-"""The commands of ``erfsfm`` that train: networks, the fusion of depth, and packs of their data."""
+"""The commands of ``erfsfm`` that train: networks, and the fusion of depth."""
 
 from __future__ import annotations
 
@@ -20,9 +20,17 @@ logger = logging.getLogger(__name__)
 def train(
     config: Annotated[str, typer.Option(help="a YAML file, or the name of a shipped configuration")],
     dataset: Annotated[
-        list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder, video or pack; repeat")
+        list[Path] | None,
+        typer.Option(help="KITTI odometry or raw root, image folder, video or prepared folder; repeat"),
     ] = None,
     output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
+    prepare: Annotated[
+        Path | None,
+        typer.Option(
+            help="write the frames, at the networks' size, and the labels to this folder, and stop: it is a "
+            "--dataset for the same training elsewhere"
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")] = False,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
@@ -34,6 +42,7 @@ def train(
     """
     from erfsfm.config import load_experiment
     from erfsfm.training.comparison import depth_before_and_after
+    from erfsfm.training.run import prepare as prepare_training
     from erfsfm.training.run import train as run_training
 
     changes = list(overrides or [])
@@ -42,6 +51,10 @@ def train(
     experiment = load_experiment(config, changes).with_roots(dataset or [])
     command = shlex.join(["erfsfm", *sys.argv[1:]])
     with progress_bar() as progress:
+        if prepare is not None:
+            prepare_training(experiment, prepare, progress)
+            typer.echo(f"train with: erfsfm train --config {config} --dataset {prepare}")
+            return
         folder = run_training(experiment, output, resume, device, command, progress)
         typer.echo(f"weights in {folder}: use them with --weights {folder}")
         if experiment.initial_weights is None or experiment.data.validation_share == 0:
@@ -76,33 +89,3 @@ def train_fusion(
     print_rows([metrics], as_json)
     if not as_json:
         typer.echo(f"network in {output}: use it with --set depth.fusion={output}")
-
-
-def pack(
-    config: Annotated[str, typer.Option(help="of the training: a YAML file, or the name of a shipped configuration")],
-    dataset: Annotated[
-        list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder or video; repeat")
-    ] = None,
-    output: Annotated[Path, typer.Option(help="a new folder, --dataset of the training")] = Path("pack"),
-    shard_megabytes: Annotated[
-        float, typer.Option(min=0.1, help="largest size of a tar file; training needs one for each loader process")
-    ] = 4.0,
-    quality: Annotated[int, typer.Option(min=1, max=100, help="of the JPEG images")] = 85,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
-) -> None:
-    """Pack the data of a training for another machine: frames at the networks' size, and what the teacher measured.
-
-    All of it goes to tar files that training reads one after the other, also over HTTP.
-
-    Example: erfsfm pack --config default-gpu --dataset KITTI --dataset worlds --set teacher.cache=labels --output pack
-    """
-    from erfsfm.config import load_experiment
-    from erfsfm.training.pack import pack as run_packing
-
-    experiment = load_experiment(config, list(overrides or [])).with_roots(dataset or [])
-    with progress_bar() as progress:
-        done = run_packing(experiment, output, shard_megabytes, quality, progress)
-    typer.echo(
-        f"{done.size / 1e6:.1f} MB in {output}: {done.shards} shards with {done.frames} frames and {done.labels} labels"
-    )
-    typer.echo(f"train with: erfsfm train --config {config} --dataset {output}")

@@ -197,9 +197,8 @@ class TrainingConfig(Section):
     devices: int = Field(
         default=1,
         ge=1,
-        description="GPUs of a machine, or processes on its CPU; batch normalisation is synchronised on GPUs alone",
+        description="GPUs, or processes on the CPU; batch normalisation is synchronised on GPUs alone",
     )
-    nodes: int = Field(default=1, ge=1, description="machines, on each of which the same command is started")
     networks: TrainedNetworks = Field(
         default="both",
         description="trained networks; the other one keeps its initial weights, and is not written without any",
@@ -207,13 +206,7 @@ class TrainingConfig(Section):
     frozen_stages: int = Field(
         default=0, ge=0, le=7, description="first stages of a lite0 encoder that keep their weights, the stem being one"
     )
-    optimiser: Literal["adam", "muon"] = Field(
-        default="adam", description="muon: orthogonalised steps for convolution kernels, Adam for the rest"
-    )
-    learning_rate: float = Field(default=2e-4, gt=0, description="of Adam, and of Muon times kernel_rate")
-    kernel_rate: float = Field(
-        default=1.0, gt=0, description="factor on the learning rate of convolution kernels under muon"
-    )
+    learning_rate: float = Field(default=2e-4, gt=0, description="of Adam")
     offset_rate: float = Field(
         default=1.0, gt=0, le=1, description="factor on the learning rate of deformable offsets, which may diverge"
     )
@@ -243,11 +236,6 @@ class TrainingConfig(Section):
     )
     seed: int = Field(default=0, ge=0, le=2**31 - 1, description="of initial weights, snippets and augmentation")
 
-    @property
-    def processes(self) -> int:
-        """Number of processes on all machines."""
-        return self.nodes * self.devices
-
     def of_batch(self, share: float) -> int:
         """Samples of a batch that a share comes to, rounded down."""
         return int(share * self.batch)
@@ -264,9 +252,7 @@ class ExperimentConfig(Section):
     pretrained: Literal["imagenet", "none"] = Field(
         default="imagenet", description="what the encoder of a lite0 network starts from, without initial_weights"
     )
-    initial_weights: str | None = Field(
-        default=None, description="weights to start from; presets may differ, and widths by a factor of two"
-    )
+    initial_weights: str | None = Field(default=None, description="weights to start from; presets may differ")
 
     def with_roots(self, roots: Sequence[Path]) -> Self:
         """The same experiment on further data sets."""
@@ -303,10 +289,8 @@ class ExperimentConfig(Section):
             )
         if self.training.networks == "pose" and self.teacher.views != "many":
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
-        if self.training.minutes > 0 and self.training.processes > 1:
-            raise ValueError(
-                "training.minutes needs training.devices: 1 and training.nodes: 1: the clocks of several would differ"
-            )
+        if self.training.minutes > 0 and self.training.devices > 1:
+            raise ValueError("training.minutes needs training.devices: 1: the clocks of several would differ")
         network, plain = self.network, any("lite0" not in name for name in (self.network.depth, self.network.pose))
         one_pixel = max(network.height, network.width) <= _LAST_MAP_ONE_PIXEL
         if plain and network.normalisation == "batch" and self.training.batch == 1 and one_pixel:

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-SMALLEST = 0.0012  # inverse depth of code 0, one over camera heights: 1.4 km
-STEP = 0.025  # of the logarithm of the inverse depth between codes
+SMALLEST = 0.002  # inverse depth of code 0, one over camera heights: 800 m; code 255 is 0.7 m
+STEP = 0.0275  # of the logarithm of the inverse depth between codes
 LEAST_SIGMA = 0.01  # of the logarithm, of the first kind of measured pixel
 _UNKNOWN, _AT_LEAST, _AT_MOST, _MEASURED = range(4)  # kinds of pixels; each further kind has twice the sigma
 _WIDEST = 8

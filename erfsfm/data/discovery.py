@@ -1,4 +1,4 @@
-"""Recordings under a root: KITTI odometry (real or simulated), KITTI raw drives, image folders, videos, packs.
+"""Recordings under a root: KITTI odometry (real or simulated), KITTI raw, images, videos, prepared folders.
 
 Discovery reads folder names and the first image of each recording, and counts the frames of videos. A recording
 with missing frame numbers is split there, so that no snippet spans a gap in time.
@@ -23,7 +23,7 @@ from erfsfm.common.readers.kitti_drives import (
 )
 from erfsfm.common.readers.numbering import by_name, by_number
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos
-from erfsfm.data.pack_index import INDEX_FILE, read_pack
+from erfsfm.data.prepared import INDEX_FILE, read_prepared
 from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.data.video import Video
 from erfsfm.geometry.camera import Camera
@@ -49,7 +49,8 @@ def discover(root: Path) -> list[Recording]:
         entries = ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
         raise DataError(
             f"no recording in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
-            f"(2011_09_26/..._sync/image_02), images or a video with camera.yaml, or a pack ({INDEX_FILE}); found "
+            f"(2011_09_26/..._sync/image_02), images or a video with camera.yaml, or a prepared folder "
+            f"({INDEX_FILE}); found "
             f"{entries or 'an empty folder'}"
         )
     return found
@@ -57,7 +58,7 @@ def discover(root: Path) -> list[Recording]:
 
 def _recordings_at(root: Path) -> list[Recording]:
     if (root / INDEX_FILE).is_file():
-        return read_pack(root)
+        return read_prepared(root)
     odometry = find_odometry_root(root)
     if odometry is not None:
         return [r for folder in sorted(odometry.folders()) for r in _odometry(odometry, folder)]

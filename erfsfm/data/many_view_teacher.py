@@ -26,6 +26,7 @@ from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.common.threads import limit_library_threads
 from erfsfm.data.array_cache import ArrayCache
+from erfsfm.data.compact_label import decode
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
@@ -50,22 +51,29 @@ Learned = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H
 
 @dataclass(frozen=True)
 class DriveLabels:
-    """Poses and labels of one drive under ``folder``; labels have the networks' ``size`` (height, width)."""
+    """Poses and labels of one drive under ``folder``; labels have the networks' ``size`` (height, width).
+
+    In a prepared folder labels are ``compact``. There the recording may be a part, of which the frames before its first
+    are ``skipped``.
+    """
 
     recording: Recording
     folder: Path
     size: tuple[int, int]
     stride: int
+    compact: bool = False
+    skipped: int = 0
 
     def targets(self, sources: int) -> range:
         """Frames with a label that have half of ``sources`` on either side, counted from the recording's first."""
         half = sources // 2
-        return range(-(-half // self.stride) * self.stride, len(self.recording) - half, self.stride)
+        return range(half + -(self.skipped + half) % self.stride, len(self.recording) - half, self.stride)
 
     @cached_property
     def T_world_camera(self) -> NDArray[np.float64]:
         """Poses ``(N, 4, 4)`` in camera heights."""
-        return np.asarray(np.load(self.poses_file, allow_pickle=False))
+        poses = np.load(self.poses_file, allow_pickle=False)
+        return np.asarray(poses[self.skipped : self.skipped + len(self.recording)])
 
     @property
     def poses_file(self) -> Path:
@@ -79,7 +87,8 @@ class DriveLabels:
 
     def label_file(self, target: int) -> Path:
         """Least and most inverse depth of one frame."""
-        return self.folder / f"{self.size[1]}x{self.size[0]}" / f"{target:06d}.npz"
+        name = f"{self.skipped + target:06d}{'.webp' if self.compact else '.npz'}"
+        return self.folder / f"{self.size[1]}x{self.size[0]}" / name
 
     def motion(self, first: int, sources: int) -> NDArray[np.float32]:
         """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at a frame, in camera heights."""
@@ -93,6 +102,8 @@ class DriveLabels:
         """
         path = self.label_file(target)
         try:
+            if self.compact:
+                return decode(path.read_bytes())
             with np.load(path, allow_pickle=False) as entry:
                 return entry["least"], entry["most"]
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -250,8 +261,11 @@ class ManyViewTeacher:
         """Where the labels of a recording are kept."""
         known = self._drives.get(id(recording))
         if known is None:
-            folder = self._folder / self._digest(recording)
-            known = self._drives[id(recording)] = DriveLabels(recording, folder, self._size, self._stride)
+            if recording.labels is not None:
+                known = DriveLabels(recording, recording.labels, self._size, self._stride, True, recording.skipped)
+            else:
+                known = DriveLabels(recording, self._folder / self._digest(recording), self._size, self._stride)
+            self._drives[id(recording)] = known
         return known
 
     def structure(self, recording: Recording, first: int, sources: int) -> TeacherStructure:
@@ -269,7 +283,8 @@ class ManyViewTeacher:
         others wait for it.
 
         Raises:
-            TrainingError: a drive has no trajectory or no scale, or poses by other weights.
+            TrainingError: a drive has no trajectory or no scale, poses by other weights, or too few labels in a
+                prepared folder.
         """
         with FolderLock() as lock:
             lock.wait_for(self._folder)
@@ -280,6 +295,12 @@ class ManyViewTeacher:
         for drive in drives:
             drive.require_weights(weights)
         without = [drive for drive in drives if not drive.poses_file.is_file()]
+        for drive in drives:
+            if drive.compact and (drive in without or (self.measures != "poses" and any(_missing(drive, sources)))):
+                raise TrainingError(
+                    f"{drive.folder} holds not all labels of many views that are wanted: prepare the data again with "
+                    "this teacher and this size of the networks"
+                )
         for done, drive in enumerate(without):
             progress("teacher: poses", done, len(without))
             drive.measure_poses(weights)

@@ -16,7 +16,6 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import read_image, read_values, resize_image
 from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.config import Fidelity
-from erfsfm.data.shards import InShards
 from erfsfm.data.video import Video
 from erfsfm.geometry.camera import Camera
 
@@ -33,8 +32,8 @@ class Recording:
     The poses are of camera 0, which lies at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the name of its
     folder in an odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a recording
     with gaps, ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for these
-    alone. ``without_stops`` says that frames in which the car stands still were taken out when it was packed. The
-    frames of one with ``packed`` are in tar files; `erfsfm.data.shard_draws` reads them.
+    alone. Of one in a prepared folder, ``labels`` is where the teacher's measurements are, and ``without_stops`` says
+    that frames in which the car stands still were taken out before.
     """
 
     name: str
@@ -51,7 +50,7 @@ class Recording:
     skipped: int = 0
     stored: int = 0
     without_stops: bool = False
-    packed: InShards | None = None
+    labels: Path | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -80,12 +79,8 @@ class Recording:
         """Frame as ``(height, width, 3)`` uint8 RGB, resized without crop.
 
         Raises:
-            DataError: the file is missing, incomplete, not an image, of another size than the camera, or in a shard.
+            DataError: the file is missing, incomplete, no image, or of another size than the camera.
         """
-        if self.packed is not None:
-            raise DataError(
-                f"{self.name} lies in shards, which are to train on alone: use the recording that was packed"
-            )
         stored = self.images[index]
         if self.video is not None:
             self._require_size(stored, self.video.height, self.video.width)

@@ -19,14 +19,11 @@ from erfsfm.labels.structure import HEIGHTS, TeacherStructure
 # focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
 FOCAL_LENGTH = 1.9
 
-_MOST_FRAMES = 10_000_000  # of a recording
-
 
 def training_sample(
     images: list[NDArray[np.uint8]],
     camera: Camera,
     seen: TeacherStructure | None,
-    place: tuple[int, int],
     config: ExperimentConfig,
     rng: np.random.Generator,
 ) -> dict[str, Tensor]:
@@ -36,23 +33,17 @@ def training_sample(
         images: N + 1 in time order at the networks' size, ``(H, W, 3)`` each.
         camera: of these images.
         seen: what the teacher measured, if there is one.
-        place: number of the recording, and the snippet's first frame in it.
         config: of the experiment.
         rng: of all random draws.
 
     Returns:
-        Tensors ``target`` (3, H, W) and ``sources`` (N, 3, H, W) in uint8, ``K`` (3, 3), and ``frames`` (N + 1): of
-        each image in time order a number that is its own, mirrored another one. With a teacher, also
+        Tensors ``target`` (3, H, W) and ``sources`` (N, 3, H, W) in uint8, and ``K`` (3, 3). With a teacher, also
         ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With weather, also
         ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
     """
-    network = config.network
     bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
-    images, bounds, varied, mirrored = augment(images, bounds, camera, config.data, network.fidelity, rng)
+    images, bounds, varied, mirrored = augment(images, bounds, camera, config.data, config.network.fidelity, rng)
     sample = as_tensors(images, varied.K)
-    which, first = place
-    number = (2 * which + mirrored) * _MOST_FRAMES + first
-    sample["frames"] = torch.arange(number, number + network.sources + 1)
     if seen is not None:
         T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
         nearer = 1.0

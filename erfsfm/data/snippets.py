@@ -67,7 +67,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
         index, count = (worker.id, worker.num_workers) if worker else (0, 1)
-        batch, processes = self._config.training.batch, self._config.training.processes
+        batch, processes = self._config.training.batch, self._config.training.devices
         mine = self._first_draw + self._rank * batch
         for number, first in enumerate(range(mine, self._draws, batch * processes)):
             if number % count == index:
@@ -83,13 +83,12 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         if self._exact is not None and number % training.batch < training.of_batch(self._config.data.exact):
             return self._exact.draw(rng)
         snippet, images = self._reader.first_readable(self._chosen(rng), self._images)
-        recording, which = snippet.recording, self.recordings.index(snippet.recording)
-        camera = recording.camera.resized(network.width, network.height, network.fidelity)
+        camera = snippet.recording.camera.resized(network.width, network.height, network.fidelity)
         seen = self._structure(snippet, images, camera)
         if self._config.single_images:
             assert seen is not None, "there are labels"
             return single_image(images[0], camera, (seen.least, seen.most), self._config, rng)
-        return training_sample(images, camera, seen, (which, snippet.first), self._config, rng)
+        return training_sample(images, camera, seen, self._config, rng)
 
     def _images(self, snippet: Snippet) -> list[NDArray[np.uint8]]:
         """Those of a sample in time order: the snippet's, or its target alone."""

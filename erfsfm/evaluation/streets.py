@@ -134,7 +134,7 @@ def _truth(recording: Recording, index: int) -> Depth:
 
 def _frame(recording: Recording, index: int) -> tuple[Image, Depth]:
     truth = _truth(recording, index)
-    return recording.image(index, *truth.shape), truth  # of a pack the images are smaller
+    return recording.image(index, *truth.shape), truth  # prepared images are smaller
 
 
 def _median_map(truths: list[Depth]) -> Depth:

@@ -19,7 +19,6 @@ from erfsfm.networks.blocks import (
 )
 from erfsfm.networks.image_alignment import Alignment, aligned
 
-MAX_SOURCES = 8
 POSE_SCALE = 0.01
 
 _KERNELS = (7, 5, 3, 3, 3, 3, 3)
@@ -53,8 +52,6 @@ class PoseNet(nn.Module):
         alignment: Alignment = "none",
     ) -> None:
         super().__init__()
-        if not 1 <= sources <= MAX_SOURCES:
-            raise ValueError(f"sources must be 1 to {MAX_SOURCES}; got {sources}")
         self.variant = variant
         self.fidelity = fidelity
         self.sources = sources

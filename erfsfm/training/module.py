@@ -25,7 +25,6 @@ from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
 from erfsfm.networks.presets import NetworkKind
-from erfsfm.training.muon import Muon, is_matrix
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
@@ -165,14 +164,7 @@ class SelfSupervision(lightning.LightningModule):
             {"params": pretrained, "lr": training.learning_rate * training.encoder_rate},
         ]
         slowly = slowly[: 2 if pretrained else 1]
-        optimiser: torch.optim.Optimizer
-        if training.optimiser == "muon":
-            others: dict[str, Any] = {"params": [p for p in rest if not is_matrix(p)]}
-            kernels: dict[str, Any] = {"params": [p for p in rest if is_matrix(p)], "orthogonal": True}
-            kernels["lr"] = training.learning_rate * training.kernel_rate
-            optimiser = Muon([others, kernels, *slowly], lr=training.learning_rate)
-        else:
-            optimiser = torch.optim.Adam([{"params": rest}, *slowly], lr=training.learning_rate, betas=(0.9, 0.999))
+        optimiser = torch.optim.Adam([{"params": rest}, *slowly], lr=training.learning_rate, betas=(0.9, 0.999))
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimiser, lambda step: learning_rate_factor(training.schedule, self._progress(step))
         )

@@ -61,7 +61,7 @@ class OutputFolder:
         begun = load_experiment(written)
         if begun.network != config.network:
             raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
-        for key in ("optimiser", "networks", "frozen_stages"):
+        for key in ("networks", "frozen_stages"):
             before, now = getattr(begun.training, key), getattr(config.training, key)
             if before != now:
                 raise ConfigError(

@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import tempfile
 import warnings
 from datetime import timedelta
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.fabric.plugins.environments import LightningEnvironment, SLURMEnvironment, TorchElasticEnvironment
+from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint, Timer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
@@ -33,9 +34,9 @@ from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import opencv_threads
 from erfsfm.config import ExperimentConfig, Precision, TrainingConfig
 from erfsfm.data.exact_depth import by_label, stacked
+from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
-from erfsfm.data.shard_draws import ShardDraws, in_shards
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
 from erfsfm.training.keeper import Average, Patience, WeightKeeper
@@ -60,7 +61,7 @@ def train(
 ) -> Path:
     """Train, validate, keep the best.
 
-    Of several processes (see `rank_of`) all but the first exit here; those of other nodes share the output folder.
+    With several devices Lightning starts the program again for each further one; these exit here.
 
     Args:
         config: the experiment.
@@ -80,7 +81,7 @@ def train(
     """
     _require_devices(config.training.devices, device)
     folder = OutputFolder(output)
-    rank = rank_of(config.training)
+    rank = LightningEnvironment().local_rank()
     done_steps = folder.resumable_steps(config) if resume else 0
     if rank == 0 and not resume:  # the first process has written there before it starts the others
         folder.require_free()
@@ -90,7 +91,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(training, validation, config, (done_steps, rank), output, progress)
+    draws = _draws(training, config, (done_steps, rank), output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
@@ -99,8 +100,6 @@ def train(
         module.validation_metrics = keeper.metrics_at(done_steps)
     loader = _loader(draws, config, device)
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
-    if config.training.nodes > 1:
-        logger.warning("training begins when this command runs on all %d machines", config.training.nodes)
     with raising_on_termination(), FolderLock() as lock:
         if rank == 0:
             lock.take(output)
@@ -112,19 +111,27 @@ def train(
     return output
 
 
-def rank_of(training: TrainingConfig) -> int:
-    """Number of this process among the processes of all nodes, as Lightning counts it.
+def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent) -> None:
+    """Write the frames and labels of a training to a folder, to train from elsewhere; see `write_prepared`.
 
-    With several devices Lightning starts the program again for each further one of its node. On every node it is
-    started once, with the environment that Lightning, torchrun or SLURM reads.
+    Raises:
+        ConfigError: ``output`` is taken.
+        DataError: nothing to train on, or another training than this would come of it.
+        TrainingError: the teacher cannot measure a drive.
     """
-    if training.processes == 1:
-        return 0
-    for started in (TorchElasticEnvironment, SLURMEnvironment):
-        if started.detect():
-            return int(started().global_rank())
-    own = LightningEnvironment()
-    return int(own.node_rank() * training.devices + own.local_rank())
+    training, validation = split_recordings(config.data)
+    training = usable(training, config.network.sources + 1)
+    _, measured = by_label(training, config.data)
+    held_out = ValidationSnippets(validation, config).snippets if validation else []
+    with tempfile.TemporaryDirectory() as temporary:
+        teacher = measured_views(measured, config, config.teacher.cache or Path(temporary), progress)
+        write_prepared(output, training, held_out, teacher, config.network, progress)
+    again, _ = split_recordings(config.data.model_copy(update={"roots": [output]}))
+    if trained_on(again) != trained_on(training):
+        raise DataError(
+            f"{output} would train on {trained_on(again)}, not on {trained_on(training)}: set data.validation instead "
+            "of data.validation_share"
+        )
 
 
 def _require_devices(wanted: int, device: str) -> None:
@@ -152,28 +159,22 @@ def _keeper(
 
 def _draws(
     training: list[Recording],
-    validation: list[Recording],
     config: ExperimentConfig,
     position: tuple[int, int],
     output: Path,
     progress: Progress,
-) -> SnippetDraws | ShardDraws:
+) -> SnippetDraws:
     """What this process trains on; ``position``: steps done and rank."""
     done_steps, rank = position
-    together = config.training.batch * config.training.processes
+    together = config.training.batch * config.training.devices
     draws, done = config.training.steps * together, done_steps * together
     _, measured = by_label(training, config.data)
-    sharded = in_shards(measured, validation)
-    if sharded and config.teacher.views == "network":
-        raise ConfigError("teacher.views=network needs images as files, not in shards: name the data sets themselves")
-    if sharded:
-        return ShardDraws(training, config, draws, done, rank)
     folder = config.teacher.cache or output / MEASUREMENTS
     many_views = measured_views(measured, config, folder, progress)
     return SnippetDraws(training, config, draws, done, rank, many_views, imitated(config))
 
 
-def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
+def _loader(draws: SnippetDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
     workers = config.data.workers
     return DataLoader(
         draws,
@@ -218,7 +219,7 @@ def _fit(
 
 
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
-    """Load initial weights, also of another variant or half the width; returns what they were trained on."""
+    """Load initial weights, also of another variant; returns what they were trained on."""
     name, wanted = config.initial_weights, config.network
     model = load_model(name) if name else None
     loaded = [kind for kind in KINDS if model is not None and model.record.networks in ("both", kind)]
@@ -232,10 +233,10 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
         module.take_imagenet([kind for kind in KINDS if kind not in loaded])
     if model is None:
         return []
-    free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width", "alignment")}
+    free = {key: getattr(wanted, key) for key in ("depth", "pose", "alignment")}
     try:
         if model.record.network.model_copy(update=free) != wanted:
-            raise ConfigError("only presets, widths and alignment may differ")
+            raise ConfigError("only presets and alignment may differ")
         for kind in loaded:
             trained = model.depth_net if kind == "depth" else model.pose_net
             take_over(module.network(kind), trained.state_dict())
@@ -279,11 +280,10 @@ def _trainer(
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
     stops = [Patience(training.patience)] if training.patience else []
     average = [callbacks[0].average] if callbacks[0].average else []
-    several = training.processes > 1
+    several = training.devices > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
         devices=training.devices,
-        num_nodes=training.nodes,
         strategy=DDPStrategy(find_unused_parameters=bool(without_gradient(config))) if several else "auto",
         sync_batchnorm=several and not on_cpu,
         use_distributed_sampler=False,  # each process has its own draws, and all validate everything

@@ -57,7 +57,7 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(erfsfm-slam simulate .*)--route loop --frames \d+", r"\1--route straight --frames 12"),
     (r"^(erfsfm-slam simulate .*)--frames \d+", r"\1--frames 12"),
     (r"^erfsfm train .*", r"\g<0> --set training.steps=2 --set training.batch=2"),
-    (r"^(erfsfm pack --config tiny .* --output) pack", r"\1 again"),  # the workspace has it, to train from
+    (r"^(erfsfm train .* --prepare) prepared", r"\1 again"),  # the workspace has it, to train from
     (r"--split eigen", "--split my_frames.txt"),  # the 697 frames of Eigen are not here
     (r"^erfsfm receptive-field (?!.*--images).*", rf"\g<0> --width {WIDTH} --height {HEIGHT}"),
     (r"--dataset ROOT --sequence (NAME|\d\d)", "--dataset KITTI --sequence 05"),
@@ -84,7 +84,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^pip install ", "it downloads"),
     (
         r"--config default-gpu ",
-        "it wants hours of labels, and a GPU; tests/erfsfm/training/test_pack.py packs small data",
+        "it wants hours of labels, and a GPU; tests/erfsfm/data/test_prepared.py has small data",
     ),
     (r"^erfsfm-slam download ", "it downloads; tests/slam/commands/downloads has a server"),
     (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/commands/calibration renders them"),
@@ -276,7 +276,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         call(f"erfsfm-slam simulate held_out {size} --frames 60 --seed 501")
         train = "erfsfm train --config tiny --dataset world --set training.steps=2 --output"
         call(f"{train} runs/toy")
-        call("erfsfm pack --config tiny --dataset world --output pack")
+        call("erfsfm train --config tiny --dataset world --prepare prepared")
         call(f"{train} runs/table1-dfc --set network.sources=4")
         call("erfsfm predict world/sequences/sim/image_2 --weights runs/toy --output depth")
         call("erfsfm export --weights runs/toy --format onnx --output net.onnx")

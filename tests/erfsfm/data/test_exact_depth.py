@@ -17,11 +17,9 @@ from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
 from erfsfm.data.exact_depth import FARTHEST_M, by_label, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.samples import FOCAL_LENGTH
-from erfsfm.data.shard_draws import ShardDraws
 from erfsfm.data.snippets import SnippetDraws, split_recordings
 from erfsfm.model_record import read_record
-from erfsfm.training.pack import pack
-from erfsfm.training.run import train
+from erfsfm.training.run import prepare, train
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.rooms import SimulatedRooms
@@ -108,24 +106,19 @@ def test_it_trains(mixed: Callable[..., ExperimentConfig], measure: Callable[...
     assert load_experiment(output / "config.yaml").data.exact == 0.5
 
 
-def test_worlds_as_files_train_beside_a_pack_of_the_rest(
-    world: Path, mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path
+def test_a_prepared_folder_trains_without_the_worlds(
+    mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path
 ) -> None:
     config = mixed()
     measure(config, lambda *_: 0.25)
-    pack(config, tmp_path / "pack", quality=95)
-    assert "simulated" not in (tmp_path / "pack" / "pack.yaml").read_text()
-    config = mixed((world, tmp_path / "pack"))
-    config = config.model_copy(update={"teacher": config.teacher.model_copy(update={"cache": None})})
-    recordings, _ = split_recordings(config.data)
-    samples = [*ShardDraws(recordings, config, 12)]
-    assert ["sources" not in sample for sample in samples] == [True, True, False, False] * 3
-    labels = torch.stack([sample["least"] for sample in samples if "sources" in sample])
-    assert float((labels[labels > 0].log() - labels[labels > 0].log().median()).abs().max()) < 0.03
-    resumed = [*ShardDraws(recordings, config, 12, first_draw=8)]
-    for sample, again in zip(samples[8:], resumed, strict=True):
-        torch.testing.assert_close(sample, again)
-    train(config, tmp_path / "run", device="cpu")
+    prepare(config, tmp_path / "prepared")
+    original, again = (
+        SnippetDraws(split_recordings(c.data)[0], c, 4) for c in (config, mixed((tmp_path / "prepared",)))
+    )
+    for number in range(2):
+        one, other = original.draw(number), again.draw(number)
+        torch.testing.assert_close(other["least"], one["least"], msg="exact depth of the same pixels")
+    train(mixed((tmp_path / "prepared",)), tmp_path / "run", device="cpu")
     assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["simulated/1", "kitti_odometry/00[0:12]"]
 
 

@@ -12,7 +12,6 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.snippets import SnippetDraws, split_recordings
 from erfsfm.inference import DepthPosePredictor
@@ -71,11 +70,3 @@ def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path) 
 def test_it_teaches_nothing_but_depth(tmp_path: Path, teacher: dict[str, Any], sections: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="teaches depth alone"):
         imitation(tmp_path, teacher, **sections)
-
-
-def test_shards_hold_no_images_for_it(
-    write_root: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("erfsfm.training.run.in_shards", lambda *_: True)
-    with pytest.raises(ConfigError, match=r"teacher\.views=network"):
-        train(imitation(write_root(tmp_path / "real", 5)), tmp_path / "run", device="cpu")

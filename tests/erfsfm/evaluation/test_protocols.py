@@ -14,7 +14,7 @@ from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
-from erfsfm.training.pack import pack
+from erfsfm.training.run import prepare
 
 
 class Oracle:
@@ -57,8 +57,8 @@ def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small:
     roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
     roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
     data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3}
-    pack(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "pack")
-    networks, _ = depth_protocol(Oracle(STEP), [tmp_path / "pack"], allow_leak=False)
+    prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
+    networks, _ = depth_protocol(Oracle(STEP), [tmp_path / "prepared"], allow_leak=False)
     assert networks["images"] == 3
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
 

@@ -25,15 +25,9 @@ def test_shape(variant, fidelity):
     assert PoseNet(variant, fidelity, width=0.1)(target, sources).shape == (2, 4, 6)
 
 
-@pytest.mark.parametrize("count", range(1, 9))
+@pytest.mark.parametrize("count", [1, 2, 8])
 def test_numbers_of_sources(count):
     assert PoseNet(width=0.1, sources=count)(*images(count)).shape == (2, count, 6)
-
-
-@pytest.mark.parametrize("count", [0, 9, -1])
-def test_impossible_numbers_of_sources(count):
-    with pytest.raises(ValueError, match=f"sources must be 1 to 8; got {count}"):
-        PoseNet(sources=count)
 
 
 def test_wrong_number_of_sources():

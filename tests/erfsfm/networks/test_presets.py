@@ -93,7 +93,6 @@ def test_width_scales_hidden_channels_and_not_the_heads():
         ({"name": "posenet", "normalisation": "group"}, "normalisation must be one of none, batch"),
         ({"name": "posenet", "width": 0.0}, "width must be above 0"),
         ({"name": "posenet", "width": float("nan")}, "width must be above 0"),
-        ({"name": "posenet", "sources": 9}, "sources must be 1 to 8; got 9"),
     ],
 )
 def test_known_errors(options, message):

@@ -33,19 +33,6 @@ def test_a_network_with_zero_offsets_has_the_same_output_in_another_variant(firs
     torch.testing.assert_close(fresh(*seen), trained(*seen), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["erf-depthnet-dfcv2", "erf-posenet-dfc"])
-def test_twice_the_width_has_nearly_the_same_output_and_different_gradients(name: str):
-    trained, wide = made(name), made(name, width=0.5, seed=1)
-    take_over(wide, trained.state_dict())
-    image = torch.rand(1, 3, 64, 96)
-    seen = (image,) if "depth" in name else (image, [image.flip(3), image.flip(2), image, image * 0.5])
-    widened, wanted = wide(*seen), trained(*seen)
-    assert (widened - wanted).norm() < 0.1 * wanted.norm()
-    weights = wide.state_dict().items()
-    kernels = [value for key, value in weights if "encoder" in key and value.dim() == 4 and value.any()]
-    assert kernels and all((kernel[0] != kernel[1]).any() for kernel in kernels)
-
-
 def test_the_same_variant_keeps_everything():
     trained, fresh = made("erf-posenet-dfc"), made("erf-posenet-dfc", seed=1)
     take_over(fresh, trained.state_dict())
@@ -53,7 +40,7 @@ def test_the_same_variant_keeps_everything():
         torch.testing.assert_close(fresh.state_dict()[key], value)
 
 
-@pytest.mark.parametrize("other", [made("depthnet", width=0.75), made("posenet")])
+@pytest.mark.parametrize("other", [made("depthnet", width=0.5), made("posenet")])
 def test_another_network_is_refused_and_nothing_changes(other: torch.nn.Module):
     fresh = made("erf-depthnet-dfc")
     before = {key: value.clone() for key, value in fresh.state_dict().items()}

@@ -21,21 +21,6 @@ def test_offset_predictors_have_their_own_learning_rate():
         assert rates[id(layer.kernel.weight)] == 1e-3
 
 
-def test_muon_takes_every_parameter_once_and_kernels_at_their_own_rate():
-    network = NetworkConfig(depth="erf-depthnet-dfcv2", pose="erf-posenet-dfc", depth_width=0.25, pose_width=0.25)
-    training = TrainingConfig(optimiser="muon", learning_rate=1e-3, kernel_rate=4, offset_rate=0.1)
-    module = SelfSupervision(ExperimentConfig(network=network, training=training))
-    groups = module.configure_optimizers()["optimizer"].param_groups
-    placed = [id(p) for group in groups for p in group["params"]]
-    assert sorted(placed) == sorted(id(p) for p in module.parameters())
-    kernels = {id(p) for group in groups if group["orthogonal"] for p in group["params"]}
-    assert {group["lr"] for group in groups if group["orthogonal"]} == {4e-3}
-    assert id(module.depth_net.iconvs[0][0].weight) in kernels
-    assert id(module.depth_net.heads[0].weight) not in kernels
-    layer = next(layer for layer in module.modules() if isinstance(layer, DeformableConv2d))
-    assert id(layer.offset.weight) not in kernels and id(layer.kernel.weight) in kernels
-
-
 def test_an_untrained_pose_network_keeps_its_weights_and_norm_statistics():
     network = NetworkConfig(
         depth="depthnet", pose="posenet", depth_width=0.0625, pose_width=0.125, normalisation="batch", sources=2

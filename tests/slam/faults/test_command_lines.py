@@ -91,7 +91,6 @@ VERBS = (
     Verb("erfsfm", "receptive-field", ("--network", "posenet", "--output", "out.png"), quick=False),
     Verb("erfsfm", "train", ("--config", "tiny", "--dataset", "in/root", "--set", "training.steps=1"), quick=False),
     Verb("erfsfm", "train-fusion", ("--dataset", "in/root", "--validation", "in/root", "--steps", "1"), quick=False),
-    Verb("erfsfm", "pack", ("--config", "tiny", "--dataset", "in/root", "--output", "out"), quick=False),
 )
 
 

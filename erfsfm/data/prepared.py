@@ -1,0 +1,238 @@
+"""A prepared folder: what a training needs of its data, at the networks' size, to train from elsewhere.
+
+Each recording has a folder of its frames with the teacher's poses and labels beside them. Snippets to validate on are
+recordings of their own, with their truth. Names, frame numbers and cameras are those of the originals, so that weights
+record the same training data.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pydantic import Field, ValidationError
+
+from erfsfm.common.config_tree import Section, dump_yaml, first_problem
+from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.progress import Progress
+from erfsfm.common.yaml_file import YamlError, read_yaml
+from erfsfm.config import NetworkConfig
+from erfsfm.data.compact_label import encode
+from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher
+from erfsfm.data.recordings import Recording
+from erfsfm.data.window import Snippet
+from erfsfm.geometry.camera import Camera
+
+logger = logging.getLogger(__name__)
+
+INDEX_FILE = "prepared.yaml"
+QUALITY = 90  # of the JPEG images: 16 kB each at 416x128
+_MOST_FRAMES = 10**6  # of one recording: a day at ten frames a second
+
+
+class _Camera(Section):
+    """Size and intrinsics of the images, pixels."""
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+
+
+class _Entry(Section):
+    """Consecutive frames of one recording, in a folder that its place in the index names."""
+
+    name: str = Field(min_length=1, description="as in the leak record, without frames")
+    start: int = Field(ge=0, description="number of the first frame")
+    frames: int = Field(gt=0, le=_MOST_FRAMES)
+    camera: _Camera
+    camera_height_m: float | None = Field(default=None, gt=0, description="of a simulated world")
+
+
+class _Index(Section):
+    """The content of ``prepared.yaml``."""
+
+    recordings: list[_Entry]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """The files of one recording."""
+
+    folder: Path
+
+    def image(self, frame: int) -> Path:
+        return self.folder / "images" / f"{frame:06d}.jpg"
+
+    def depth(self, frame: int) -> Path:
+        """True depth, 1/256 m."""
+        return self.folder / "depth" / f"{frame:06d}.png"
+
+    @property
+    def poses(self) -> Path:
+        """True poses of this camera, in KITTI's format."""
+        return self.folder / "poses.txt"
+
+    @property
+    def labels(self) -> Path:
+        """What the many-view teacher measured."""
+        return self.folder / "labels"
+
+
+def read_prepared(root: Path) -> list[Recording]:
+    """The recordings of a prepared folder.
+
+    Raises:
+        DataError: the index is damaged.
+    """
+    try:
+        index = _Index.model_validate(read_yaml(root / INDEX_FILE))
+    except YamlError as error:
+        raise DataError(str(error)) from error
+    except ValidationError as error:
+        raise DataError(f"{root / INDEX_FILE} is damaged: {first_problem(error)}; prepare again") from error
+    return [_recording(_place(root, number), entry) for number, entry in enumerate(index.recordings)]
+
+
+def write_prepared(
+    output: Path,
+    training: Sequence[Recording],
+    held_out: Sequence[Snippet],
+    teacher: ManyViewTeacher | None,
+    network: NetworkConfig,
+    progress: Progress,
+) -> None:
+    """Write a prepared folder, whole or not at all; one warning counts the images that cannot be read.
+
+    Args:
+        output: new or empty.
+        training: recordings to train on; of those with exact depth this is kept, at the networks' size.
+        held_out: snippets to validate on.
+        teacher: whose measurements are kept, of the recordings without exact depth.
+        network: whose size the frames get.
+        progress: told of the stage, what is done, and of how many.
+
+    Raises:
+        ConfigError: ``output`` is taken.
+        DataError: no image can be read.
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise ConfigError(f"--prepare {output} is not empty: choose a new folder; nothing was changed")
+    length, middle = network.sources + 1, network.sources // 2
+    snippets = [snippet.recording.part(snippet.first, snippet.first + length) for snippet in held_out]
+    recordings = [*training, *snippets]
+    unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
+    try:
+        unreadable: list[str] = []
+        for number, recording in enumerate(recordings):
+            progress("frames", number, len(recordings))
+            place = _place(unfinished, number)
+            unreadable += _write_images(place, recording, network)
+            if number >= len(training):
+                _write_truth(place, recording, middle)
+            elif recording.exact:
+                for index in range(len(recording)):
+                    _put(place.depth(recording.start + index), _shrunk_depth(recording, index, network))
+            elif teacher is not None:
+                _write_labels(teacher.drive(recording), place, network)
+        total = sum(map(len, recordings))
+        if len(unreadable) == total:
+            raise DataError(f"none of {total} images can be read: {unreadable[0]}")
+        if unreadable:
+            logger.warning("%d of %d images cannot be read and are left out: %s", len(unreadable), total, unreadable[0])
+        entries = _Index(recordings=[_entry(recording, network) for recording in recordings])
+        (unfinished / INDEX_FILE).write_text(dump_yaml(entries))
+        unfinished.replace(output)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _place(root: Path, number: int) -> _Place:
+    return _Place(root / f"{number:04d}")
+
+
+def _recording(place: _Place, entry: _Entry) -> Recording:
+    numbers = range(entry.start, entry.start + entry.frames)
+    depth = tuple(place.depth(n) if place.depth(n).is_file() else None for n in numbers)
+    return Recording(
+        entry.name,
+        tuple(place.image(n) for n in numbers),
+        Camera(**entry.camera.model_dump()),
+        depth=depth if any(depth) else None,
+        poses_file=place.poses if place.poses.is_file() else None,
+        camera_height_m=entry.camera_height_m,
+        start=entry.start,
+        stored=entry.frames,
+        without_stops=True,
+        labels=place.labels,
+    )
+
+
+def _entry(recording: Recording, network: NetworkConfig) -> _Entry:
+    camera = recording.camera.resized(network.width, network.height, network.fidelity)
+    return _Entry(
+        name=recording.name,
+        start=recording.start,
+        frames=len(recording),
+        camera=_Camera(**vars(camera)),
+        camera_height_m=recording.camera_height_m,
+    )
+
+
+def _write_images(place: _Place, recording: Recording, network: NetworkConfig) -> list[str]:
+    """Write the frames; returns what is wrong with those that cannot be read."""
+
+    def shrink(index: int) -> str:
+        try:
+            image = recording.image(index, network.height, network.width)
+        except DataError as error:
+            return str(error)
+        jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+        _put(place.image(recording.start + index), bytes(jpeg))
+        return ""
+
+    one_by_one = recording.video is not None  # a video is decoded in order
+    with ThreadPoolExecutor(1 if one_by_one else os.cpu_count()) as pool:
+        return [problem for problem in pool.map(shrink, range(len(recording))) if problem]
+
+
+def _write_truth(place: _Place, snippet: Recording, middle: int) -> None:
+    """Write what is known of a snippet to validate on: depth of its middle frame, as it is stored, and poses."""
+    depth = snippet.depth[middle] if snippet.depth else None
+    if depth is not None:
+        _put(place.depth(snippet.start + middle), depth.read_bytes())
+    T_world_camera = snippet.true_poses()
+    if T_world_camera is not None:
+        np.savetxt(place.poses, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
+
+
+def _write_labels(measured: DriveLabels, place: _Place, network: NetworkConfig) -> None:
+    """Write the poses and labels that are there, labels in their compact form."""
+    kept = DriveLabels(measured.recording, place.labels, measured.size, measured.stride, compact=True)
+    kept.keep_poses(measured.T_world_camera)
+    if measured.weights_file.is_file():
+        shutil.copyfile(measured.weights_file, kept.weights_file)
+    for target in measured.targets(network.sources):
+        if measured.label_file(target).is_file():
+            _put(kept.label_file(target), encode(*measured.label(target)))
+
+
+def _shrunk_depth(recording: Recording, index: int, network: NetworkConfig) -> bytes:
+    depth_m = recording.true_depth(index)
+    assert depth_m is not None, "the recording is exact"
+    small = cv2.resize(depth_m, (network.width, network.height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return bytes(cv2.imencode(".png", np.rint(small * 256).astype(np.uint16))[1])
+
+
+def _put(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)

@@ -145,9 +145,9 @@ def write_raw() -> Callable[..., Path]:
     return write
 
 
-# rows of the paper's tables that differ in the size of images alone, or repeat another table's, count once
+# rows of the paper's tables that differ in the size of images alone count once
 _CONFIGURATIONS = {
-    re.sub(r"-\d+x\d+$|^table3-depthnet-|^table1-", "", path.stem): path.stem
+    re.sub(r"-\d+x\d+$", "", path.stem): path.stem
     for path in sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
 }
 

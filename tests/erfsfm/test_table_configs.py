@@ -1,4 +1,4 @@
-"""One complete experiment for each row of the paper's Tables 1 to 3, at the paper's resolutions."""
+"""The trainings behind the rows of the paper's Tables 1 to 3, at the paper's resolutions."""
 
 from __future__ import annotations
 
@@ -19,9 +19,6 @@ ROWS = {
     *(f"table1-posenet-{size}" for size in ALL),
     *(f"table1-erf-posenet-{variant}-{size}" for variant in ("dilated", "dfc", "dfcv2") for size in MIDDLE),
     *(f"table2-erf-depthnet-{row}" for row in ("dfc-416x128", "dfcv2-416x128", "dfc-620x188")),
-    *(f"table3-depthnet-posenet-{size}" for size in ALL),
-    *(f"table3-depthnet-erf-posenet-{variant}-{size}" for variant in ("dilated", "dfc") for size in MIDDLE),
-    "table3-depthnet-erf-posenet-dfcv2-416x128",
     "table3-erf-depthnet-dfc-erf-posenet-dfc-620x188",
 }
 

@@ -309,15 +309,10 @@ def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
 
 
 def is_prediction(depth_file: Path) -> bool:
-    """Whether a ``.npy`` file and the ``.png`` beside it were predicted: the picture must be that of the array."""
-    picture_file = depth_file.with_suffix(".png")
-    if not (depth_file.is_file() and picture_file.is_file()):
-        return False
+    """Whether a ``.npy`` file and the ``.png`` beside it look predicted: one a depth map of the other's size."""
     try:
-        depth, picture = np.load(depth_file, mmap_mode="r", allow_pickle=False), read_image(picture_file)
-    except (OSError, ValueError, EOFError, DataError):
+        depth = np.load(depth_file, mmap_mode="r", allow_pickle=False)
+        size = read_image(depth_file.with_suffix(".png")).shape[:2]
+        return bool(depth.dtype == np.float32 and depth.shape == size)
+    except (OSError, ValueError, EOFError, AttributeError, DataError):
         return False
-    if not isinstance(depth, np.ndarray) or depth.dtype != np.float32 or depth.shape != picture.shape[:2]:
-        return False
-    with np.errstate(all="ignore"):
-        return np.array_equal(colour_disparity(depth), picture)

@@ -19,15 +19,12 @@ from typing import NoReturn, TextIO
 import typer
 
 from erfsfm.common.errors import OUT_OF_MEMORY, OneLineError, one_line
-from erfsfm.common.memory import require_memory
 from erfsfm.common.signals import Terminated
 
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
-_LOADING_BYTES = 384 * 2**20  # of NumPy, OpenCV and SciPy: OpenBLAS waits for ever for memory that it cannot have
 # what they would say of a file is said in our own line
 _OPENCV = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
-_NOT_UTF8 = "is not in UTF-8: rename it, or set the environment variable LC_ALL to C.UTF-8"
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
 _MAY_BE_EMPTY = ("--hazards", "--hazards=")
 # what libraries in C++ say when memory ran out, whatever they raise
@@ -82,8 +79,6 @@ def run(app: Callable[..., object], name: str, level: int) -> None:
     _quieten_libraries()
     Terminal(level)
     try:
-        require_memory(_LOADING_BYTES)
-        _check_current_folder(name)
         try:
             app(args=_checked(sys.argv[1:], name), prog_name=name)
         finally:  # the last line is that of the error
@@ -119,25 +114,13 @@ def _shows_all() -> bool:
     return os.environ.get(SHOW_TRACEBACK, "0") not in ("", "0")
 
 
-def _check_current_folder(name: str) -> None:
-    """End where it was removed, for libraries that cannot be loaded then, or where files cannot hold its name."""
-    try:
-        folder = Path.cwd()
-    except FileNotFoundError:
-        _end(f"{name}: the folder that you are in was removed: change to another one", 1)
-    if not _is_text(str(folder)):
-        _end(f"{name}: the name of the folder that you are in {_NOT_UTF8}", 1)
-
-
 def _checked(words: Sequence[str], name: str) -> list[str]:
     """The words with ``~`` and ``~/`` as the home folder.
 
-    An empty one, as of a shell variable that is not set, is refused, and one that no text file can hold.
+    An empty one, as of a shell variable that is not set, is refused.
     """
     checked = []
     for before, word in zip(["", *words], words):
-        if not _is_text(word):
-            _end(f"{name}: {word!a} {_NOT_UTF8}", 1)
         option = _OPTION.match(word)
         start, value = (option.group(), word[option.end() :]) if option else ("", word)
         if not value and before not in _MAY_BE_EMPTY and start not in _MAY_BE_EMPTY:
@@ -145,14 +128,6 @@ def _checked(words: Sequence[str], name: str) -> list[str]:
             _end(f"{name}: {where} is empty: give a value or leave it out (is a shell variable not set?)", 2)
         checked.append(start + (str(Path(value).expanduser()) if value == "~" or value.startswith("~/") else value))
     return checked
-
-
-def _is_text(word: str) -> bool:
-    try:
-        word.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _explained(error: Exception) -> str:

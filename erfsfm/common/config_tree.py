@@ -134,8 +134,7 @@ def _override(tree: dict[str, Any], text: str) -> None:
         section = tree.get(part, {})
         if not isinstance(section, dict):
             raise ConfigError(f"--set {text}: '{part}' is not a section")
-        tree[part] = dict(section)  # an alias in the file may have made it another section too
-        tree = tree[part]
+        tree = tree.setdefault(part, section)
     tree[parts[-1]] = value
 
 

@@ -14,8 +14,6 @@ from pathlib import Path
 
 MAX_TEXT_BYTES = 256 * 2**20  # a trajectory of a million frames
 MAX_IMAGE_BYTES = 2**30
-_BLOCK_BYTES = 2**20
-WAIT_FOR_PIPE_S = 10.0
 _PARTIAL = re.compile(r"\.\d+\.\d+\.partial\.(?P<name>.+)")
 
 
@@ -59,20 +57,14 @@ def is_foreign(path: Path, mark: str) -> bool:
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The content of a file that has no more than ``most`` bytes; also of a pipe that something is written to.
+    """The content of a file that has no more than ``most`` bytes; also of a pipe.
 
     Raises:
         OSError: it cannot be read, or is larger.
     """
-    with open(path, "rb", opener=lambda name, _: open_written(name, WAIT_FOR_PIPE_S)) as file:
-        size = os.fstat(file.fileno()).st_size  # 0 of a pipe, which is read in blocks
-        parts = [file.read(size)] if size <= most else []
-        while size <= most and (block := file.read(_BLOCK_BYTES)):
-            parts.append(block)
-            size += len(block)
-    if size > most:
-        raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
-    return b"".join(parts)
+    if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
+        return content
+    raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
 
 
 def open_written(path: str, wait_s: float) -> int:

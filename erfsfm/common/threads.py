@@ -1,4 +1,4 @@
-"""How many threads libraries may start, and the memory that they work in, without importing torch."""
+"""How many threads libraries may start, without importing torch."""
 
 from __future__ import annotations
 
@@ -7,14 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import cv2
-import numpy as np
-import scipy.linalg
 from threadpoolctl import threadpool_limits
-
-from erfsfm.common.memory import require_memory
-
-_LINEAR_ALGEBRA_BYTES = 192 * 2**20
-_LARGE_MATRIX = 64  # rows; smaller ones are decomposed without it
 
 
 def usable_cores() -> int:
@@ -44,20 +37,6 @@ def stay_single_threaded() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"  # read when other libraries are loaded, and by `usable_cores`
     cv2.setNumThreads(1)
     threadpool_limits(1)
-
-
-def take_working_memory() -> None:
-    """Let linear algebra take its memory now: later, where none is left, OpenCV would end the process, and OpenBLAS,
-    of which NumPy and SciPy have one each, would wait for ever.
-
-    Raises:
-        MemoryError: there is not enough.
-    """
-    require_memory(_LINEAR_ALGEBRA_BYTES)
-    matrix = np.random.default_rng(0).normal(size=(_LARGE_MATRIX, _LARGE_MATRIX))
-    cv2.SVDecomp(matrix)
-    np.linalg.svd(matrix @ matrix)
-    scipy.linalg.svd(matrix)
 
 
 @contextmanager

@@ -16,7 +16,6 @@ from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.common.readers.folder import image_folder
 from erfsfm.common.readers.images import list_images, read_image
 from erfsfm.common.readers.numbering import in_order
-from erfsfm.common.threads import take_working_memory
 from slam.config.sections import LoopsConfig, load_stored
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.frontend.keyframes.camera_pose import CameraPose, resect
@@ -84,7 +83,6 @@ def localise(
         SlamError, DataError: no images, no places in the run, a camera file that does not fit, or none where the run
             undistorted its images.
     """
-    take_working_memory()
     paths = image_paths(images)
     places = Places.read(run.require(PLACES))
     if not places.views:

@@ -12,7 +12,7 @@ from pathlib import Path
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import Terminated
-from erfsfm.common.threads import limit_library_threads, take_working_memory
+from erfsfm.common.threads import limit_library_threads
 from slam.config.sections import SlamConfig, dump_yaml
 from slam.evaluation.double_walls import double_wall_share
 from slam.formats.ply import Ply
@@ -92,7 +92,6 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
     try:
         log.begin(folder.path / LOG)
         with limit_library_threads():
-            take_working_memory()
             _run(job, folder)
     except BaseException as error:
         ignore_signals()

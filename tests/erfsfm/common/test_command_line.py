@@ -45,17 +45,6 @@ def test_an_empty_option_is_refused(outcome: Outcome, words: tuple[str, ...]) ->
     assert code == 2 and err.startswith("program: --output is empty: give a value") and len(err.splitlines()) == 1
 
 
-def test_a_current_folder_that_was_removed_is_one_line(
-    outcome: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place = tmp_path / "place"
-    place.mkdir()
-    monkeypatch.chdir(place)
-    place.rmdir()
-    code, err = outcome(lambda args: None, "run")
-    assert code == 1 and err == "program: the folder that you are in was removed: change to another one\n"
-
-
 def test_a_full_standard_output_is_one_line(outcome: Outcome) -> None:
     code, err = outcome(raising(OSError(28, "No space left on device")), "run")
     assert code == 1 and err.startswith("program: No space left on device: standard output") and err.count("\n") == 1

@@ -52,17 +52,6 @@ def test_files_and_overrides(tmp_path: Path) -> None:
     )
 
 
-def test_an_override_of_a_section_changes_no_alias_of_it(tmp_path: Path) -> None:
-    class Pair(Section):
-        one: Flow
-        two: Flow
-
-    path = tmp_path / "a.yaml"
-    path.write_text("one: &flow {window_px: 7}\ntwo: *flow")
-    pair = load_config(Pair, path, ["one.window_px=9"], [])
-    assert (pair.one.window_px, pair.two.window_px) == (9, 7)
-
-
 @pytest.mark.parametrize(
     "text", ["flow.side=3", "flow={side: 3}", "bridging.enabled=false", "bridging={}", "bridging="]
 )

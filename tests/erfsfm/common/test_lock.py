@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from threading import Thread
 
@@ -13,18 +9,6 @@ import pytest
 
 from erfsfm.common.errors import BusyError
 from erfsfm.common.lock import FolderLock
-
-HOLDER = """
-import os, sys, time
-from pathlib import Path
-from erfsfm.common.lock import FolderLock
-lock = FolderLock()
-lock.take(Path(sys.argv[1]))
-if os.fork() == 0:
-    print(flush=True)
-    time.sleep(30)
-time.sleep(30)
-"""
 
 
 def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:
@@ -56,18 +40,6 @@ def test_who_waits_holds_a_folder_after_the_other(tmp_path: Path) -> None:
         events.append("held")
     thread.join(30)
     assert events == ["held", "waited"]
-
-
-def test_a_process_that_was_killed_holds_nothing_though_one_that_it_forked_lives_on(tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, process_group=0)
-    assert process.stdout is not None and process.stdout.readline()
-    with FolderLock() as lock, pytest.raises(BusyError):
-        lock.take(tmp_path)
-    process.kill()
-    process.wait()
-    with FolderLock() as lock:
-        lock.take(tmp_path)
-    os.killpg(process.pid, signal.SIGKILL)
 
 
 def test_where_no_folder_can_be_made_there_is_nothing_to_hold(tmp_path: Path) -> None:

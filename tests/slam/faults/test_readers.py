@@ -166,7 +166,7 @@ def readable(samples: Path, tmp_path: Path, reader: Reader) -> Path:
 def test_a_damaged_file_is_read_or_refused_in_one_line(
     reader: Reader, readable: Path, damage_file: Callable[..., None]
 ) -> None:
-    damage_file(readable, reader.read, reader.sound, many=False)
+    damage_file(readable, reader.read, reader.sound)
 
 
 @pytest.mark.parametrize("reader", [r for r in READERS if r.name != "cache"], ids=lambda reader: reader.name)
@@ -174,9 +174,3 @@ def test_a_folder_in_the_place_of_a_file_is_refused(
     reader: Reader, readable: Path, refuse_folder: Callable[..., None]
 ) -> None:
     refuse_folder(readable, reader.read)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_many_damaged_files(reader: Reader, readable: Path, damage_file: Callable[..., None]) -> None:
-    damage_file(readable, reader.read, reader.sound, many=True)

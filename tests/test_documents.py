@@ -1,16 +1,14 @@
-"""README and docs name files, headings, commands and configuration keys that exist."""
+"""README and docs name files, headings, commands and configuration keys that exist: one walk over the pages each."""
 
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import re
 import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
 import typer
 
 import erfsfm.cli
@@ -21,12 +19,10 @@ from slam.config.sections import SlamConfig
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 docs_site = importlib.import_module("docs_site")
-PAGES = [
-    *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
-    *sorted((ROOT / "docs").rglob("*.md")),
-    *sorted((ROOT / "erfsfm/weights").rglob("README.md")),
-]
-NAMING = [path for kind in ("slam", "erfsfm", "tools", "tests", "configs") for path in (ROOT / kind).rglob("*.*")]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+# the record of a network's training and the list of changes name what there was
+PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS)}
+LINKED = PAGES | {path: path.read_text() for path in (ROOT / "CHANGELOG.md", *ROOT.glob("erfsfm/weights/*/README.md"))}
 PROGRAMS = {"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.commands.cli.app}
 LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(?:#([^)\s]*))?\)")
 FILE = re.compile(r"(?<![\w./-])(?:slam|erfsfm|tools|tests|configs|docs)/[\w./-]*\.(?:py|yaml|md)\b")
@@ -46,65 +42,57 @@ def _anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.fixture(params=PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def page(request: pytest.FixtureRequest) -> Path:
-    """One page of the documentation."""
-    path: Path = request.param
-    return path
+def test_links_lead_to_pages_and_headings() -> None:
+    lost = []
+    for page, text in LINKED.items():
+        for target, anchor in LINK.findall(text):
+            path = page if not target else (page.parent / target).resolve()
+            if not path.exists() or (anchor and anchor not in _anchors(path)):
+                lost.append(f"{page.name}: {target}#{anchor}")
+    assert not lost
 
 
-def test_links_lead_to_pages_and_headings(page: Path) -> None:
-    for target, anchor in LINK.findall(page.read_text(encoding="utf-8")):
-        path = page if not target else (page.parent / target).resolve()
-        assert path.exists(), f"{target} does not exist"
-        if anchor:
-            assert anchor in _anchors(path), f"{target} has no heading #{anchor}"
-
-
-def test_files_that_are_named_exist(page: Path) -> None:
-    named = set(FILE.findall(page.read_text(encoding="utf-8")))
-    assert not [name for name in sorted(named) if not (ROOT / name).exists()]
-
-
-def test_configuration_keys_that_are_named_exist(page: Path) -> None:
-    inline = re.findall(r"`[^`]+`|--set \S+", page.read_text(encoding="utf-8"))
-    named = {key for text in inline for key in KEY.findall(text)}
-    assert not sorted(named - KEYS)
+def test_files_and_configuration_keys_that_are_named_exist() -> None:
+    strange = []
+    for page, text in PAGES.items():
+        strange += [f"{page.name}: {name}" for name in FILE.findall(text) if not (ROOT / name).exists()]
+        named = {key for part in re.findall(r"`[^`]+`|--set \S+", text) for key in KEY.findall(part)}
+        strange += [f"{page.name}: {key}" for key in named - KEYS]
+    assert not strange
 
 
 def test_pages_that_code_names_exist() -> None:
     missing = []
-    for path in NAMING:
+    for path in (each for kind in ("slam", "erfsfm", "tools", "tests", "configs") for each in (ROOT / kind).rglob("*")):
         if path.suffix in {".py", ".yaml", ".md", ".j2"}:
             named = re.findall(r"\bdocs/[\w/-]+\.md\b", path.read_text(encoding="utf-8"))
             missing += [f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).is_file()]
     assert not missing
 
 
-def test_the_index_lists_every_page() -> None:
-    docs = ROOT / "docs"
-    listed = {(docs / target).resolve() for target, _ in LINK.findall((docs / "README.md").read_text(encoding="utf-8"))}
-    assert listed == {*docs.rglob("*.md"), *docs.rglob("*.ipynb")} - {docs / "README.md"}
-
-
-def test_the_site_has_every_page_once() -> None:
+def test_the_index_and_the_site_have_every_page_once() -> None:
+    docs, index = ROOT / "docs", ROOT / "docs" / "README.md"
+    listed = {(docs / target).resolve() for target, _ in LINK.findall(PAGES[index])}
+    assert listed == {*DOCS, *docs.rglob("*.ipynb")} - {index}
     nav = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
-    in_docs = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
-    assert sorted(nav) == sorted(in_docs - {"README.md"} | docs_site.pages().keys())
+    assert sorted(nav) == sorted(
+        {path.relative_to(docs).as_posix() for path in DOCS} - {"README.md"} | set(docs_site.pages())
+    )
 
 
-def test_commands_that_are_named_exist(page: Path) -> None:
+def test_commands_that_are_named_exist() -> None:
     """Commands within a sentence, often not whole; tests/integration/test_documentation.py reads the others."""
-    sentences = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    for command in re.findall(r"`((?:erfsfm|erfsfm-slam|python -m) [^`]+)`", sentences):
-        program, *words = shlex.split(command.replace("[", "").replace("]", ""))
-        if program == "python":
-            assert importlib.util.find_spec(words[1]), command
-            continue
-        verb: Any = typer.main.get_command(PROGRAMS[program])
-        while words and words[0] in getattr(verb, "commands", {}):
-            verb = verb.commands[words.pop(0)]
-        assert not hasattr(verb, "commands") or not words or words[0].startswith("-"), f"no such verb: {command}"
-        known = {name for parameter in verb.params for name in parameter.opts} | {"--help"}
-        strange = {word for word in words if re.match("--?[a-z]", word)} - known
-        assert not strange, f"no such option: {command}"
+    strange = []
+    for page, text in PAGES.items():
+        sentences = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+        for command in re.findall(r"`((?:erfsfm|erfsfm-slam) [^`]+)`", sentences):
+            program, *words = shlex.split(command.replace("[", "").replace("]", ""))
+            verb: Any = typer.main.get_command(PROGRAMS[program])
+            while words and words[0] in getattr(verb, "commands", {}):
+                verb = verb.commands[words.pop(0)]
+            known = {name for parameter in verb.params for name in parameter.opts} | {"--help"}
+            if {word for word in words if re.match("--?[a-z]", word)} - known or (
+                hasattr(verb, "commands") and words and not words[0].startswith("-")
+            ):
+                strange.append(f"{page.name}: {command}")
+    assert not strange

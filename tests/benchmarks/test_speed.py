@@ -8,9 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-import torch.nn.functional as F
 
-from erfsfm.losses.photometric import box_mean
 from erfsfm.networks import deformable
 from erfsfm.networks.presets import build
 
@@ -52,14 +50,6 @@ def test_networks_forward_and_backward(cpu_ms: Clock, monkeypatch: pytest.Monkey
     for (depth, pose, path), cost in zip(rows, costs):
         path = path if "dfc" in depth + pose else ""
         print(f"| {depth} | {pose} | {path} | {cost:.0f} | {cost / costs[0]:.2f} |")
-
-
-def test_box_mean_against_pooling(cpu_ms: Clock) -> None:
-    x = torch.rand(16, 3, 130, 418)
-    ours, pooling = cpu_ms(lambda: box_mean(x), lambda: F.avg_pool2d(x, 3, 1), runs=9)
-    print("\n\n| 3 x 3 mean of 16 x 3 x 130 x 418 | CPU ms |\n|---|---:|")
-    print(f"| ours | {ours:.1f} |\n| avg_pool2d | {pooling:.1f} |")
-    torch.testing.assert_close(box_mean(x), F.avg_pool2d(x, 3, 1))
 
 
 def test_simulated_street(cpu_ms: Clock) -> None:

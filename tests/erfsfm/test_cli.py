@@ -75,27 +75,6 @@ def test_help_of_every_command_loads_no_heavy_library() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        ["fly"],
-        ["train"],
-        ["train", "--config", "tiny", "--stepz", "3"],
-        ["train", "--config", "tiny", "--seed", "x"],
-        ["train", "--config", "tiny", "--device", "tpu"],
-        ["predict"],
-        ["networks", "--fidelity", "exact"],
-        ["evaluate", "depth"],
-        ["evaluate", "speed"],
-    ],
-)
-def test_usage(run: Run, arguments: list[str]) -> None:
-    code, out, err = run(*arguments)
-    assert code == 2
-    assert out == ""
-    assert err
-
-
-@pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["train", "--config", "nothing"], "no configuration file or name 'nothing'"),
@@ -152,14 +131,6 @@ def test_errors_are_one_line(
     assert err.startswith("erfsfm: ")
     assert err.count("\n") == 1
     assert words.format(**places) in err
-
-
-def test_an_unwritable_output_is_one_line(run: Run, tmp_path: Path, weights: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((20, 30, 3), np.uint8))
-    (tmp_path / "file").write_text("")
-    code, _, err = run("predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "file")
-    assert code == 1
-    assert err.count("\n") == 1
 
 
 def test_networks_json(run: Run) -> None:

@@ -256,13 +256,6 @@ def test_nothing_is_executed(tmp_path: Path, form: str) -> None:
     assert trace.exists(), "the payload runs where code is allowed"
 
 
-@pytest.mark.parametrize("content", [{"state_dict": 3}, {"state_dict": {"a": 1}}, [1, 2], {}])
-def test_files_without_a_checkpoint(tmp_path: Path, content: object) -> None:
-    torch.save(content, tmp_path / "x.pth.tar")
-    message = refusal(tmp_path / "x.pth.tar")
-    assert "no state_dict of tensors" in message or "neither DispNetS nor PoseExpNet" in message
-
-
 def _edited(path: Path, **changes: Tensor | None) -> Path:
     state = torch.load(path, weights_only=True)["state_dict"]
     for name, value in changes.items():
@@ -281,11 +274,3 @@ def test_other_networks(tmp_path: Path, depth_file: Path, pose_file: Path) -> No
     assert "both hold a depth network" in refusal(depth_file, depth_file)
     assert "1 tensors missing" in refusal(_edited(depth_file, iconv3__0__weight=None))
     assert "which DispNetS and PoseExpNet do not have" in refusal(_edited(pose_file, conv8__0__weight=torch.zeros(2)))
-
-
-def test_refusals(tmp_path: Path, depth_file: Path) -> None:
-    assert "no pose network was given" in refusal(depth_file, dilated=True)
-    path = save(OldPose(frozenset({3, 4, 5, 6, 7})), tmp_path / "pose.pth.tar")
-    assert "deformable, not dilated" in refusal(path, dilated=True)
-    convert([depth_file], tmp_path / "new")
-    assert "holds weights already" in refusal(path, output=tmp_path / "new")

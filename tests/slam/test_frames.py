@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import threading
-
 import cv2
 import numpy as np
 
-from slam.frames import Frame, Intrinsics, RelativePose, runs
-
-
-def test_runs_of_frames() -> None:
-    assert runs({7, 3, 4, 9, 8}) == [(3, 4), (7, 9)] and runs(()) == []
+from slam.frames import Frame, Intrinsics, RelativePose
 
 
 def test_rays_project_back_to_their_pixels() -> None:
@@ -50,21 +44,6 @@ def test_what_is_derived_from_a_frame_is_kept_by_its_key() -> None:
     ]
     assert made == ["layers 1", "layers 2"]
     assert Frame(0, 0.0, image()).derived(("layers", 1), lambda: "of another frame") == "of another frame"
-
-
-def test_threads_that_derive_at_once_get_the_same_object() -> None:
-    frame, barrier, found = Frame(0, 0.0, image()), threading.Barrier(8), []
-
-    def make() -> object:
-        barrier.wait()  # all are making it at once
-        return object()
-
-    threads = [threading.Thread(target=lambda: found.append(frame.derived("shared", make))) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 8 and len(set(map(id, found))) == 1
 
 
 def test_a_relative_pose_in_another_unit_has_other_lengths_only() -> None:

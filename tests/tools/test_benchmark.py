@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import importlib
 import json
-import shutil
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import from_rotation_vector, invert
 from slam.results.folder import RunFolder
-from slam.results.metrics import Metrics, Provenance, ScaleMetrics, SequenceMetrics
+from slam.results.metrics import Metrics, ScaleMetrics, SequenceMetrics
 from slam.runtime.storage.record import Missing
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
@@ -75,42 +73,6 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache(tmp_path: Path) -> None:
-    drives = [plan.BenchmarkSequence(name, tmp_path) for name in ("a", "b")]
-    jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.min_inliers=25"])
-    assert len(jobs) == len({job.place for job in jobs}) == 2 * 2 * 3 * len(plan.ABLATION)
-    assert {job.configuration.name for job in jobs[:12]} == {plan.EVERYTHING.name}
-    assert len({job.cache for job in jobs}) == 4
-    assert all(job.arguments[-2:] == ["--set", "loops.min_inliers=25"] for job in jobs)
-
-
-def test_hazards_are_all_at_once_and_name_their_clean_drive(tmp_path: Path) -> None:
-    clean, hard = plan.worlds(tmp_path, ["loop"], [620], 800, ["clean", "hazards"])
-    assert clean.root.name == "loop-620-800-v1"
-    assert hard.root.name == "loop-620-800-hazards-v1"
-    assert (hard.clean, hard.kind) == (clean.name, "loop, hazards")
-    assert hard.simulate == (*clean.simulate, "--hazards", "moving-cars,exposure,blur,stop,rain")
-
-
-def test_full_size_has_worlds_and_originals_of_kitti(tmp_path: Path) -> None:
-    for root, name in zip(plan.ORIGINALS, ("00", "03"), strict=True):
-        images = tmp_path / "data" / root / "sequences" / name / "image_2"
-        images.mkdir(parents=True)
-        cv2.imwrite(str(images / "000000.png"), np.zeros((375, 1242, 3), np.uint8))
-    words = ["full-size", "--data", str(tmp_path / "data"), "--output", str(tmp_path / "out")]
-    options = benchmark._parser().parse_args(words)
-    jobs = benchmark._jobs(options)
-    names = [job.drive.name for job in jobs]
-    assert names == ["loop 610", "loop 611", "straight 610", "straight 611", "KITTI 00", "KITTI 03"]
-    assert jobs[0].drive.root.name == "loop-610-300-1242x375-v1"
-    assert jobs[0].drive.simulate[-4:] == ("--width", "1242", "--height", "375")
-    assert benchmark._command(options).startswith(
-        "python tools/benchmark.py full-size --data DATA --routes loop straight"
-    )
-    text = page.section("full-size", "", [work.JobResult(job, metrics(), "abc") for job in jobs], "1")
-    assert text.startswith("## Full-size") and "| KITTI 03 | default | 100 |" in text and "![" not in text
-
-
 def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any) -> None:
     results = results_of(job, {"default": [1.0, 3.0]})
     results.append(work.JobResult(replace(job, seed=2), Missing("out of memory"), "abc", "out of memory"))
@@ -152,12 +114,6 @@ def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float,
     assert isinstance(work.derive_metrics(tmp_path, in_heights).true_loops, Missing)
 
 
-def test_a_leak_is_reported(job: Any) -> None:
-    assert "LEAK" not in page.accuracy_tables([work.JobResult(job, metrics(), "abc")])
-    leaky = metrics().changed(provenance=Provenance(leak=True))
-    assert "LEAK: weights sim saw frames of loop 610" in page.accuracy_tables([work.JobResult(job, leaky, "abc")])
-
-
 def test_ablation_compares_with_the_same_seed(job: Any) -> None:
     results = results_of(job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
     table = cells(page.ablation_tables(results))
@@ -185,62 +141,6 @@ def test_two_checkouts_in_turn(tmp_path: Path) -> None:
     assert "geometry" in table[2] and str(tmp_path) not in text
 
 
-def test_a_failing_checkout_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"nonesuch by .* failed; see "):
-        drive = pairs.Drive("nonesuch", ("--dataset", str(tmp_path / "missing")))
-        pairs.in_turn([Path(__file__).parents[2]], [drive], 1, tmp_path)
-
-
-def test_only_successful_runs_of_the_same_sources_are_kept(job: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    codes = iter([-9, 0, 0, 0])
-    runs = []
-
-    def run(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
-        runs.append(words)
-        code = next(codes)
-        if code == 0:
-            (job.place / "run").mkdir()
-            (job.place / "run" / "metrics.json").write_text(metrics().to_json())
-        return subprocess.CompletedProcess(words, code, "", "")
-
-    monkeypatch.setattr(work, "revision", lambda: "abc")
-    monkeypatch.setattr(work.subprocess, "run", run)
-    monkeypatch.setattr(work, "fingerprint", lambda weights: "first")
-    work.perform(job)
-    assert work.job_result(job).reason == "killed by SIGKILL"
-    work.perform(job)
-    work.perform(job)
-    assert (len(runs), work.job_result(job).reason) == (2, "")
-    work.perform(replace(job, device="cuda"))
-    assert len(runs) == 3
-    monkeypatch.setattr(work, "fingerprint", lambda weights: "second")
-    work.perform(replace(job, device="cuda"))
-    assert len(runs) == 4
-
-
-def test_the_fingerprint_depends_on_sources_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(work, "ROOT", tmp_path)
-    for name in (*work.SOURCES, "weights"):
-        (tmp_path / name).mkdir()
-    seen = {work.fingerprint("default")}
-    (tmp_path / "slam" / "run.py").write_text("1")
-    seen.add(work.fingerprint("default"))
-    (tmp_path / "weights" / "model.safetensors").write_text("2")
-    seen.add(work.fingerprint(str(tmp_path / "weights")))
-    (tmp_path / "slam" / "__pycache__").mkdir()
-    (tmp_path / "slam" / "__pycache__" / "run.pyc").write_text("3")
-    seen.add(work.fingerprint(str(tmp_path / "weights")))
-    assert len(seen) == 3
-
-
-def test_dask_runs_every_job_once(tmp_path: Path) -> None:
-    pytest.importorskip("dask.distributed")
-    places = [tmp_path / str(n) for n in range(4)]
-    with work.workers(2, None) as spread:
-        assert sorted(spread(Path.mkdir, places)) == [(n, None) for n in range(4)]  # a second time would raise
-    assert all(place.is_dir() for place in places)
-
-
 @pytest.mark.slow
 def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
     words = ["accuracy", "--routes", "straight", "--worlds", "610", "--frames", "8", "--seeds", "0"]
@@ -262,50 +162,3 @@ def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
     before = record.stat().st_mtime_ns
     benchmark.main([*words, "--report", str(report)])
     assert record.stat().st_mtime_ns == before
-
-
-def test_maps_need_depth_maps_beside_the_images_and_name_every_part(tmp_path: Path) -> None:
-    (loop,) = plan.worlds(tmp_path, ["loop"], [610], 50, truth=("depth",))
-    assert "--depth" in loop.simulate and loop.root.name.startswith("loop-610-50-depth-")
-    (drive,) = plan.raw_drives([tmp_path / "drive_0013"])
-    jobs = plan.plan(tmp_path, [loop, drive], plan.MAPS, ["default"], [0])
-    assert len(jobs) == 2 * len(plan.MAPS)
-    assert "--sequence" in jobs[0].arguments and "--sequence" not in jobs[1].arguments
-    errors = {"accuracy_median_m": 0.1, "accuracy_90_m": 0.5, "completeness": 0.8, "f_score": {"0.2": 0.7, "0.5": 0.9}}
-    results = [work.JobResult(job, Metrics.model_validate({"map": errors | {"submaps": 3}}), "abc") for job in jobs]
-    text = page.maps_tables(results)
-    assert "| loop 610 | default | no sky | 0.100 | 0.50 |" in text and "drive_0013" in text
-
-
-def test_whole_sequences_of_kitti_begin_with_what_they_take_and_go_on_where_they_ended(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    world, root = tmp_path / "world", tmp_path / "root"
-    shape = ("--route", "straight", "--width", "208", "--height", "64", "--frames", "8", "--seed", "1")
-    work.simulate(plan.BenchmarkSequence("world", world, simulate=shape))
-    (root / "poses").mkdir(parents=True)
-    for name in ("05", "09"):
-        shutil.copytree(world / "sequences" / "sim", root / "sequences" / name)
-    shutil.copy(world / "poses" / "sim.txt", root / "poses" / "09.txt")
-    page_of_runs = tmp_path / "page.md"
-    words = ["kitti", "--kitti", str(root), "--output", str(tmp_path / "out"), "--report", str(page_of_runs)]
-    benchmark.main(words)
-    said = capsys.readouterr().err
-    assert "not in" in said and "10, 00, 01, 02, 03, 04, 06, 07, 08" in said and "05, which has no true poses" in said
-    assert "0 of 1 runs are done. To run: KITTI 09 (8); 8 frames, about 1 min" in said
-    head, row = cells(page_of_runs.read_text())
-    assert row[0] == "KITTI 09" and float(row[head.index("scale")]) > 0
-    assert row[head.index("published, 7-dof")] == "–"  # 8 frames are not the sequence
-
-    (record,) = (tmp_path / "out" / "kitti").glob("*/record.json")
-    before = record.stat().st_mtime_ns
-    benchmark.main(words)
-    assert "1 of 1 runs are done. To run: none" in capsys.readouterr().err
-    assert record.stat().st_mtime_ns == before
-
-
-def test_whole_sequences_stand_beside_published_errors(job: Any) -> None:
-    whole = metrics().changed(sequence=SequenceMetrics(frames=1591, length_m=1705.0))
-    drive = plan.BenchmarkSequence("KITTI 09", job.drive.root)
-    text = page.section("kitti", "", [work.JobResult(replace(job, drive=drive), whole, "abc")], "1")
-    assert text.startswith("## KITTI\n") and "| 3.94 (GigaSLAM) |" in text

@@ -81,11 +81,3 @@ def test_a_machine_without_the_other_system_says_so_in_the_page(tmp_path: Path) 
     assert (accuracy["poses, ours"], accuracy["poses, ORB-SLAM3"]) == ("8", "0")
     assert "ORB-SLAM3 failed on KITTI 05: ModuleNotFoundError: No module named 'pyorbslam3'" in text
     assert str(tmp_path) not in text
-
-
-def test_what_is_missing_is_one_line(tmp_path: Path) -> None:
-    options = ["--orb-python", sys.executable, "--vocabulary"]
-    with pytest.raises(SystemExit, match=r"no vocabulary of ORB-SLAM3 at .*none\.txt: give the file"):
-        compare.main([*options, str(tmp_path / "none.txt"), "--data", str(tmp_path)])
-    with pytest.raises(SystemExit, match=r"nothing to compare in .*: it holds none of KITTI 00"):
-        compare.main([*options, str(TOOLS / "compare.py"), "--data", str(tmp_path)])

@@ -15,7 +15,6 @@ from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import FloatArray, from_rotation_vector
 from slam.results.folder import RunFolder
 from slam.results.metrics import Event, Metrics, SequenceMetrics, TrackingMetrics
-from slam.runtime.storage.record import Missing
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
@@ -116,21 +115,3 @@ def test_errors_are_those_of_the_frames_with_a_true_pose(jobs: list[Any], poses:
         known = steps[2:] if job is jobs[0] else steps
         assert handheld.PATH.value(found) == pytest.approx(known.sum(), abs=1e-6)
         assert handheld.ATE.value(found) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_losses_and_waits(jobs: list[Any]) -> None:
-    events = [(2, "map begun"), (4, "lost"), (5, "relocalised"), (6, "lost"), (9, "map begun"), (9, "map joined")]
-    found = result(jobs[0], [Event(frame=frame, event=event) for frame, event in events], 8)
-    values = [definition.value(found) for definition in handheld.DEFINITIONS[3:]]
-    assert values == [2, 2, 3, 0.8]
-    ended = result(jobs[0], [Event(frame=2, event="map begun"), Event(frame=3, event="lost")])
-    assert handheld.NEW_MAP.value(ended) == FRAMES - 3
-    by_steps = work.JobResult(jobs[0], Metrics(tracking=Missing("measured from step to step")), "abc")
-    assert handheld.LOSSES.value(by_steps) == Missing("measured from step to step")
-
-
-def test_a_root_without_such_sequences_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    words = ["handheld", "--tum", str(tmp_path / "empty"), "--output", str(tmp_path / "out")]
-    with pytest.raises(SystemExit, match=r"no sequence of TUM RGB-D in .*empty: give the folder that holds them"):
-        benchmark.main(words)

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.evaluation.raw_drives import RawFrame, lidar_depth
 
@@ -85,39 +84,6 @@ def test_scans_and_jpg(tool: ModuleType, root: Path, tmp_path: Path) -> None:
     tool.prepare(root, tmp_path / "small", tool.Size(48, 32), ["00"], scans=True, jpg=True)
     assert (tmp_path / "small/sequences/00/velodyne/000000.bin").read_bytes() == b"1234"
     assert cv2.imread(str(tmp_path / "small/sequences/00/image_3/000002.jpg")).shape == (32, 48, 3)
-
-
-def test_an_interrupted_copy_is_resumed(tool: ModuleType, root: Path, tmp_path: Path) -> None:
-    small = tmp_path / "small"
-    broken = root / "dataset/sequences/04/image_3/000002.png"
-    content = broken.read_bytes()
-    broken.write_bytes(content[:40])
-    with pytest.raises(DataError, match=r"000002\.png is truncated"):
-        tool.prepare(root, small, tool.Size(48, 32), workers=1)
-    assert not any(path.name.startswith(".") for path in small.rglob("*")), "nothing half written"
-    begun = len(files(small)) - 1
-    times = {path: path.stat().st_mtime_ns for path in small.rglob("*.png")}
-    broken.write_bytes(content)
-    written, kept = tool.prepare(root, small, tool.Size(48, 32))
-    assert (kept, written + kept) == (begun, 16)
-    assert all(path.stat().st_mtime_ns == time for path, time in times.items()), "what was there is left alone"
-    assert tool.prepare(root, small, tool.Size(48, 32)) == (0, 16)
-
-
-def test_refusals(tool: ModuleType, root: Path, tmp_path: Path) -> None:
-    small = tmp_path / "small"
-    tool.prepare(root, small, tool.Size(48, 32), ["00"])
-    with pytest.raises(DataError, match="was begun at 48x32; wanted 96x32"):
-        tool.prepare(root, small, tool.Size(96, 32))
-    with pytest.raises(DataError, match=r"wanted \['07'\], found 00, 04"):
-        tool.prepare(root, tmp_path / "other", tool.Size(48, 32), ["07"])
-    with pytest.raises(DataError, match="is the data set itself"):
-        tool.prepare(root, root, tool.Size(48, 32))
-    with pytest.raises(DataError, match="at least one pixel"):
-        tool.prepare(root, tmp_path / "other", tool.Size(0, 32))
-    (root / "dataset/sequences/04/calib.txt").unlink()
-    with pytest.raises(DataError, match="intrinsics could not follow"):
-        tool.prepare(root, tmp_path / "other", tool.Size(48, 32))
 
 
 def write_raw(root: Path) -> None:

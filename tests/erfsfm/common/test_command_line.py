@@ -45,11 +45,6 @@ def test_an_empty_option_is_refused(outcome: Outcome, words: tuple[str, ...]) ->
     assert code == 2 and err.startswith("program: --output is empty: give a value") and len(err.splitlines()) == 1
 
 
-def test_a_full_standard_output_is_one_line(outcome: Outcome) -> None:
-    code, err = outcome(raising(OSError(28, "No space left on device")), "run")
-    assert code == 1 and err.startswith("program: No space left on device: standard output") and err.count("\n") == 1
-
-
 def test_the_home_folder_is_meant_in_quotes_too(outcome: Outcome) -> None:
     seen: list[str] = []
     outcome(seen.extend, "--output=~/runs", "~/drive", "a~/b", "--set", "output.root=~", "--hazards", "")
@@ -78,13 +73,6 @@ def raising(error: Exception) -> Callable[[object], object]:
 def test_every_error_is_one_line(outcome: Outcome, error: Exception, line: str) -> None:
     code, err = outcome(raising(error))
     assert code == 1 and err.startswith(line) and len(err.splitlines()) == 1
-
-
-def test_an_unexpected_error_is_shown_where_that_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["program"])
-    monkeypatch.setenv(command_line.SHOW_TRACEBACK, "1")
-    with pytest.raises(ZeroDivisionError):
-        command_line.run(lambda args, prog_name: raising(ZeroDivisionError())(args), "program", logging.WARNING)
 
 
 def test_an_error_of_a_data_loaders_process_is_its_last_line() -> None:

@@ -28,11 +28,6 @@ def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
         cv2.setNumThreads(before)
 
 
-def test_they_are_limited_without_torch() -> None:
-    program = "import sys, erfsfm.common.threads; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
 def test_one_process_of_many_starts_no_threads() -> None:
     program = (
         "import cv2, numpy\n"

@@ -86,15 +86,6 @@ def test_a_returned_image_is_unchanged_when_its_block_is_reused() -> None:
     read(cache, recording, 3, 2)
 
 
-def test_many_blocks() -> None:
-    recording = Painted()
-    cache = ImageCache(1, 8, 16)  # 2730 images in 22 blocks, the last not full
-    for _ in range(2):
-        for index in range(2730):
-            assert (cache.image(recording, index) == index % 256).all()  # type: ignore[arg-type]
-    assert len(recording.decoded) == 2730
-
-
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is read from /proc, which Linux has")
 def test_memory_stays_within_the_limit() -> None:
     """Between short-lived arrays, as a sample makes them; in a process whose memory nothing else takes or frees."""
@@ -113,8 +104,3 @@ def test_an_array_is_made_once_and_keeps_its_type() -> None:
     first, second = cache.get("a", make), cache.get("a", make)
     first[:] = 0
     assert made == [1] and second.dtype == np.float16 and np.isinf(cache.get("a", make)).all()
-
-
-def test_without_memory_nothing_is_kept() -> None:
-    cache = ArrayCache(0, (1,), np.int64)
-    assert [int(cache.get("a", lambda k=k: np.array([k]))[0]) for k in range(3)] == [0, 1, 2]

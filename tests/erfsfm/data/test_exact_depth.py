@@ -11,10 +11,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from erfsfm.common.errors import ConfigError, DataError
-from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
-from erfsfm.data.exact_depth import FARTHEST_M, by_label, stacked
+from erfsfm.data.exact_depth import FARTHEST_M, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, split_recordings
@@ -99,13 +98,6 @@ def test_a_batch_begins_with_its_share_of_single_images(
     assert singles == [True, True, False, False] * 2
 
 
-def test_it_trains(mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path) -> None:
-    config = mixed(weather=1.0)
-    measure(config, lambda *_: 0.25)
-    output = train(config, tmp_path / "run", device="cpu")
-    assert load_experiment(output / "config.yaml").data.exact == 0.5
-
-
 def test_a_prepared_folder_trains_without_the_worlds(
     mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path
 ) -> None:
@@ -120,15 +112,3 @@ def test_a_prepared_folder_trains_without_the_worlds(
         torch.testing.assert_close(other["least"], one["least"], msg="exact depth of the same pixels")
     train(mixed((tmp_path / "prepared",)), tmp_path / "run", device="cpu")
     assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["simulated/1", "kitti_odometry/00[0:12]"]
-
-
-def test_both_kinds_of_recording_are_wanted(world: Path, mixed: Callable[..., ExperimentConfig]) -> None:
-    config = mixed((world,))
-    recordings, _ = split_recordings(config.data)
-    with pytest.raises(DataError, match=r"data\.exact mixes .* found 1 and 0"):
-        by_label(recordings, config.data)
-
-
-def test_lengths_need_the_unit_of_many_views() -> None:
-    with pytest.raises(ConfigError, match=r"data\.exact needs teacher\.views: many"):
-        load_experiment("tiny", ["data.exact=0.5"])

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from pydantic import ValidationError
 
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.snippets import SnippetDraws, split_recordings
@@ -57,16 +56,3 @@ def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path) 
     assert not (output / "last" / "pose.safetensors").exists()
     record = read_record(output / "last" / "model.yaml")
     assert set(read_record(find_weights("sim") / "model.yaml").trained_on) <= set(record.trained_on)
-
-
-@pytest.mark.parametrize(
-    ("teacher", "sections"),
-    [
-        ({}, {"training": {"networks": "both"}}),
-        ({}, {"loss": {"photometric_weight": 1}}),
-        ({"structure_weight": 0}, {}),
-    ],
-)
-def test_it_teaches_nothing_but_depth(tmp_path: Path, teacher: dict[str, Any], sections: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError, match="teaches depth alone"):
-        imitation(tmp_path, teacher, **sections)

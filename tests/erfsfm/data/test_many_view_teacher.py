@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from threading import Thread
 
 import cv2
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 
 from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig
-from erfsfm.data import many_view_teacher
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
@@ -70,26 +68,6 @@ def test_what_was_measured_is_kept_and_what_was_lost_is_measured_again(recording
     teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
     assert told == [("teacher: depth", 1, 1)]
     assert kept.stat().st_mtime_ns == written and len(lost.read_bytes()) == len(before)
-
-
-def test_of_two_programs_with_one_folder_one_measures(recording, teacher, tmp_path, monkeypatch):
-    """In two processes, a label each, as they are measured in this one."""
-    monkeypatch.setattr(many_view_teacher, "_CHUNK", 1)
-    told = {1: [], 2: []}
-    both = {number: ManyViewTeacher(tmp_path, SIZE, stride=12) for number in told}
-    both[1].drive(recording).keep_poses(teacher.drive(recording).T_world_camera)
-
-    def prepare(number):
-        both[number].prepare([recording], 4, "sim", lambda *progress: told[number].append(progress))
-
-    threads = [Thread(target=prepare, args=(number,)) for number in told]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert sorted(map(len, told.values())) == [0, 2], "measured once"
-    for target in (12, 24):
-        np.testing.assert_array_equal(both[2].drive(recording).label(target), teacher.drive(recording).label(target))
 
 
 def test_images_are_read_again_only_when_they_changed(recording, tmp_path, monkeypatch):
@@ -171,17 +149,6 @@ def test_poses_alone_need_no_label(recording, teacher, tmp_path):
 def test_poses_by_other_weights_are_refused(recording, teacher):
     with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:28\] by the weights 'sim', and .* 'default'"):
         teacher.prepare([recording], 4, "default", lambda *_: None)
-
-
-def test_a_damaged_label_is_one_line(recording, teacher):
-    path = teacher.drive(recording).label_file(24)
-    whole = path.read_bytes()
-    path.write_bytes(whole[:100])
-    try:
-        with pytest.raises(TrainingError, match=r"000024\.npz is damaged or missing: delete it and start again"):
-            teacher.drive(recording).label(24)
-    finally:
-        path.write_bytes(whole)
 
 
 def test_a_drive_that_the_slam_system_cannot_follow_is_one_line(recording, tmp_path):

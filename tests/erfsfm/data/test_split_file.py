@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.data.split_file import Split, read_split_file
 
@@ -34,27 +33,3 @@ def test_nothing_is_in_two_lists(name: str) -> None:
 )
 def test_runs(runs: str, frames: list[int]) -> None:
     assert Split(test=[f"kitti_raw/a[{runs}]"]).test_frames() == [("kitti_raw/a", frame) for frame in frames]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("tests: [a]", "is no split, a file of the lists train, validation and test: tests: Extra inputs"),
-        ("test: a", "test: Input should be a valid list"),
-        ("- a", "all of it: Input should be a valid dictionary"),
-        ("test: [", "is not YAML"),
-        ("test: " + "[" * 3000, "nested levels"),
-        ("test: [a]\ntest: [b]", "duplicate key 'test'"),
-    ],
-)
-def test_malformed_split_files(tmp_path: Path, text: str, words: str) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
-    with pytest.raises(DataError, match=words) as caught:
-        read_split_file(str(path))
-    assert "\n" not in str(caught.value)
-
-
-def test_an_unknown_split() -> None:
-    with pytest.raises(DataError, match="no split 'eigne': neither a file nor one of eigen, odometry"):
-        read_split_file("eigne")

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import open_drive
 from erfsfm.data.recordings import Recording
 from erfsfm.data.standstill import moving_parts
@@ -41,19 +40,6 @@ def test_parts_of_parts_keep_their_numbers(tmp_path: Path, write_raw: WriteDrive
     assert names == [f"{left.name}[1:3]", f"{left.name}[4:6]"]
 
 
-def test_missing_packets(tmp_path: Path, write_raw: WriteDrive, caplog: pytest.LogCaptureFixture) -> None:
-    drive = write_raw(tmp_path, speeds=[9, 9, 0, 0, 9])
-    (drive / "oxts/data/0000000001.txt").write_text("49.0 8.4\n")
-    (drive / "oxts/data/0000000004.txt").unlink()
-    assert spans(open_drive(drive)[0]) == [(0, 2), (4, 5)], "their frames are kept"
-    assert "2 of 5 frames have no speed and are kept" in caplog.text
-    assert "0000000001.txt has 2 numbers, not 30" in caplog.text
-    for packet in (drive / "oxts/data").iterdir():
-        packet.unlink()
-    with pytest.raises(DataError, match=r"0000000000\.txt is missing: the speed"):
-        moving_parts(open_drive(drive)[0].part(0, 4))
-
-
 def street(shift: int, traffic: int, gain: float, rng: np.random.Generator) -> np.ndarray:
     """A picture that the camera's motion shifts, with a car that passes, noise and an exposure."""
     v, u = np.mgrid[:64, :208].astype(np.float64)
@@ -75,11 +61,6 @@ def test_by_images_where_there_is_no_speed(tmp_path: Path, write_raw: WriteDrive
     for recording in open_drive(drive):
         assert recording.oxts is None
         assert spans(recording) == [(0, 4), (7, 10)]
-
-
-def test_one_frame_alone(tmp_path: Path, write_raw: WriteDrive) -> None:
-    left, _ = open_drive(write_raw(tmp_path, speeds=None, frames=1))
-    assert spans(left) == [(0, 1)]
 
 
 @pytest.mark.parametrize(

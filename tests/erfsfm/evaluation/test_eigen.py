@@ -117,38 +117,6 @@ def test_the_eigen_list(tmp_path: Path) -> None:
     assert len(overlapping([f"kitti_raw/{frame.drive}" for frame in frames], odometry)) == 100
 
 
-@pytest.mark.parametrize(
-    ("drive", "wanted"),
-    [
-        ("2011_09_26_drive_0002", [*range(0, 66, 3), 69, 72, 75]),
-        ("2011_09_26_drive_0020", [*range(0, 22, 3), 27, 33, 36, *range(42, 79, 3), 84]),
-        ("2011_09_26_drive_0106", [15, *range(35, 220, 8)]),
-        ("2011_09_30_drive_0016", [frame for frame in range(0, 276, 11) if frame != 99]),
-    ],
-)
-def test_frames_of_the_eigen_list(tmp_path: Path, drive: str, wanted: list[int]) -> None:
-    assert [frame.index for frame in read_split("eigen", tmp_path) if frame.drive == drive] == wanted
-
-
-def test_a_yaml_split_of_the_user(tmp_path: Path, write_drive: Write) -> None:
-    root = write_drive(tmp_path / "raw")
-    path = tmp_path / "mine.yaml"
-    path.write_text(f"test:\n  - kitti_raw/{DRIVE}[0:5:2, 8]\n")
-    assert [frame.index for frame in read_split(str(path), root)] == [0, 2, 4, 8]
-    assert eigen_protocol(Oracle(), root, str(path), "default", allow_leak=False)[0]["images"] == 4
-    path.write_text("test: ['kitti_odometry/09[3]']\n")
-    with pytest.raises(DataError, match="'kitti_odometry/09' is no drive of KITTI raw"):
-        read_split(str(path), root)
-    with pytest.raises(DataError, match="'kitti_odometry/09' names no single frames"):
-        read_split("odometry", root)
-
-
-def test_a_scan_without_points_in_the_crop(tmp_path: Path, write_drive: Write, split: str) -> None:
-    root = write_drive(tmp_path / "raw", points=np.zeros((0, 4), np.float32))
-    with pytest.raises(DataError, match="frame 0 hits nothing under 80 m"):
-        eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
-
-
 def test_a_given_scale_and_clipping_by_hand() -> None:
     truth, guess = np.array([[10.0, 60.0]], np.float32), np.array([[3.0, 100.0]], np.float32)
     before = depth_errors(guess, truth, scaling=2.0, clipping="before")

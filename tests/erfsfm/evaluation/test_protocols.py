@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.discovery import discover
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
 from erfsfm.training.run import prepare
 
@@ -106,26 +105,3 @@ def test_paper_fidelity_counts_four_empty_snippets(tmp_path: Path, write_root: C
     default = pose_protocol(Oracle(STEP), tmp_path, ["00"], "default", allow_leak=False)[1]
     paper = pose_protocol(Oracle(STEP), tmp_path, ["00"], "paper", allow_leak=False)[1]
     assert paper["ate_mean"] == pytest.approx(default["ate_mean"] * 5 / 9)
-
-
-def test_refusals(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    write_root(tmp_path / "short", frames=4, step=STEP)
-    with pytest.raises(DataError, match="a snippet needs 5"):
-        pose_protocol(Oracle(STEP), tmp_path / "short", ["00"], "default", allow_leak=False)
-    with pytest.raises(DataError, match="4 sources"):
-        pose_protocol(Oracle(STEP, sources=2), tmp_path / "short", ["00"], "default", allow_leak=False)
-    with pytest.raises(DataError, match="no sequence 07"):
-        pose_protocol(Oracle(STEP), tmp_path / "short", ["07"], "default", allow_leak=False)
-    with pytest.raises(DataError, match="no true depth"):
-        depth_protocol(Oracle(STEP), [tmp_path / "short"], allow_leak=False)
-    (tmp_path / "short/poses/00.txt").unlink()
-    with pytest.raises(DataError, match="no true poses"):
-        pose_protocol(Oracle(STEP), tmp_path / "short", ["00"], "default", allow_leak=False)
-
-
-def test_depth_of_several_sizes_is_refused(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    write_root(tmp_path / "a", frames=1, seed=600, depth=True)
-    write_root(tmp_path / "b", frames=1, seed=601, depth=True, size=(32, 48))
-    assert len(discover(tmp_path)) == 2
-    with pytest.raises(DataError, match="different sizes"):
-        depth_protocol(Oracle(STEP), [tmp_path], allow_leak=False)

@@ -18,28 +18,6 @@ PointsAt = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float
 Write = Callable[..., Path]
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        f"2011_09_26/{DRIVE}_sync/image_02/data/0000000005.png",
-        f"2011_09_26/{DRIVE}_sync/image_02/data/0000000005.jpg",
-        f"2011_09_26/{DRIVE}_sync 0000000005 l",
-        f"{DRIVE} 5",
-        f"  {DRIVE}_sync 5\n",
-    ],
-)
-def test_lines(line: str) -> None:
-    frame = RawFrame.parse(line, Path("root"))
-    assert (frame.drive, frame.index, frame.camera) == (DRIVE, 5, 2)
-    assert frame.name == f"kitti_raw/{DRIVE}[5:6]"
-    assert frame.folder == Path(f"root/2011_09_26/{DRIVE}_sync")
-
-
-def test_right_camera() -> None:
-    assert RawFrame.parse(f"{DRIVE} 5 r", Path()).camera == 3
-    assert RawFrame.parse(f"2011_09_26/{DRIVE}_sync/image_03/data/0000000005.png", Path()).camera == 3
-
-
 def test_windows_shift_at_the_ends(tmp_path: Path, write_drive: Write) -> None:
     write_drive(tmp_path, frames=9)
     windows = {i: RawFrame(tmp_path, DRIVE, i).window(4) for i in (0, 2, 4, 8)}
@@ -90,37 +68,6 @@ def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write) -> Non
     values[6] = 20.0  # northwards, in frame 5 alone: 0.1 s of mean 10 m/s on each side
     (oxts / "0000000005.txt").write_text(" ".join(map(str, values)))
     np.testing.assert_allclose(displacements(RawFrame(root, DRIVE, 4), [2, 3, 4, 5, 6]), [0, 0, 1, 2], atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("gone", "words"),
-    [
-        ("image_02/data/0000000003.png", "0000000003.png .* is missing"),
-        ("velodyne_points/data/0000000003.bin", "true depth .* comes from the LiDAR"),
-        ("oxts/data/0000000003.txt", "a packet of the GPS/IMU a frame"),
-        ("oxts/timestamps.txt", "needs a date and a time a frame"),
-        ("../calib_cam_to_cam.txt", "no calib_cam_to_cam.txt in .*: KITTI ships it as DATE_calib.zip"),
-    ],
-)
-def test_missing_files(tmp_path: Path, write_drive: Write, gone: str, words: str) -> None:
-    frame = RawFrame(write_drive(tmp_path), DRIVE, 3)
-    (frame.folder / gone).resolve().unlink()
-    with pytest.raises(DataError, match=words) as caught:
-        frame.image_path()
-        lidar_depth(frame, (64, 96))
-        displacements(frame, [1, 2, 3, 4, 5])
-    assert "\n" not in str(caught.value)
-
-
-def test_damaged_files(tmp_path: Path, write_drive: Write) -> None:
-    frame = RawFrame(write_drive(tmp_path), DRIVE, 3)
-    scan = frame.folder / "velodyne_points/data/0000000003.bin"
-    scan.write_bytes(scan.read_bytes()[:-3])
-    with pytest.raises(DataError, match="four numbers a point"):
-        lidar_depth(frame, (64, 96))
-    (frame.folder.parent / "calib_velo_to_cam.txt").write_text("R: 1 2 3\nT: 0 0 0\n")
-    with pytest.raises(DataError, match="row R has 3 numbers: it needs 9"):
-        lidar_depth(RawFrame(tmp_path, DRIVE, 2), (64, 96))
 
 
 def _brute_force(root: Path, drive: str, index: int, size: tuple[int, int]) -> NDArray[np.float64]:

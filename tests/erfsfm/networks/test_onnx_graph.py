@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -64,15 +62,6 @@ def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, m
 
 
 @torch.inference_mode()
-def test_outputs_are_deterministic_from_the_first_call_on() -> None:
-    network = with_moving_taps(build("erf-depthnet-dfcv2", width=0.125))
-    graph = OnnxGraph(lambda: network, 1)
-    given = inputs("depth", 0)
-    answers = [graph(*given) for _ in range(4)]
-    assert all(np.array_equal(answer, answers[0]) for answer in answers)
-
-
-@torch.inference_mode()
 def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 1)
     network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
@@ -81,31 +70,3 @@ def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pyt
     before = len(calls)
     graph(*inputs("depth", 0))
     assert len(calls) == before + 1
-
-
-def test_a_network_that_raises_keeps_raising() -> None:
-    class Refusing(nn.Module):
-        def forward(self, image: Tensor) -> Tensor:
-            raise ValueError("no network here")
-
-    graph = OnnxGraph(Refusing, 1)
-    for _ in range(2):
-        with pytest.raises(ValueError, match="no network here"):
-            graph(np.zeros(SIZE, np.float32))
-
-
-def test_an_export_in_a_thread_warns_of_nothing_and_keeps_the_warning_filters() -> None:
-    """`warnings.catch_warnings` would replace the filters of every thread while the graph is made."""
-    seen: list[object] = []
-
-    class Watching(nn.Module):
-        def forward(self, image: Tensor) -> Tensor:
-            seen.append(warnings.filters)
-            return image * 2.0 if image.sum() < 1e9 else image
-
-    with warnings.catch_warnings(record=True) as warned:
-        graph = OnnxGraph(lambda: Watching().eval(), 1)
-        with ThreadPoolExecutor(1) as thread:
-            thread.submit(graph, np.zeros(SIZE, np.float32)).result()
-        assert all(filters is warnings.filters for filters in seen)
-    assert not warned

@@ -1,8 +1,5 @@
 import pytest
 
-from erfsfm.checkpoint import Model, build_networks
-from erfsfm.config import NetworkConfig
-from erfsfm.model_record import ModelRecord
 from erfsfm.receptive_field.measure import measure_fields
 from erfsfm.receptive_field.street import street_snippet
 
@@ -43,16 +40,3 @@ def test_pushed_taps(name, side, columns, fraction):
     assert summary["offsets_px"] == (1.0 if "dfc" in name else 0.0)
     assert summary["columns"] == columns
     assert summary["share"] == pytest.approx(fraction, abs=6e-4)
-
-
-@pytest.mark.parametrize("sources", [2, 4])
-def test_learned_weights_are_used_for_their_own_preset_alone(sources):
-    config = NetworkConfig(pose="erf-posenet-dfc", depth_width=0.1, pose_width=0.1, sources=sources)
-    model = Model(ModelRecord(network=config, trained_on=[]), *build_networks(config))
-    rows = by_name(["depthnet", "posenet", "erf-posenet-dfc"], learned=("mine", model))
-    assert [row.weights for row in rows.values()] == ["mine", "untrained", "mine"]
-    before = rows["erf-posenet-dfc", "default"].weighed.gradient
-    for parameter in model.pose_net.encoder.parameters():
-        parameter.data.mul_(0.9).add_(0.01)
-    after = by_name(["erf-posenet-dfc"], learned=("mine", model))["erf-posenet-dfc", "default"].weighed.gradient
-    assert not before.equal(after)

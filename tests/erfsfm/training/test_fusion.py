@@ -11,9 +11,7 @@ import pytest
 import torch
 
 from erfsfm.cli import main
-from erfsfm.common.errors import CheckpointError
 from erfsfm.mvs.evidence import CHANGE, CHANNELS
-from erfsfm.mvs.fusion import FILE, DepthFusion
 from erfsfm.networks.fusion_net import FusionNet
 from erfsfm.training.fusion import fusion_loss
 
@@ -70,22 +68,3 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(
     done = subprocess.run([sys.executable, "-m", "slam", *run, "--output", str(tmp_path / "run")], capture_output=True)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["depth"]["refined"]["median_rel"] < 0.5
-
-
-def test_what_is_no_fusion_network_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="erfsfm train-fusion"):
-        DepthFusion(str(tmp_path))
-    (tmp_path / FILE).write_bytes(b"no graph")
-    with pytest.raises(CheckpointError, match="damaged"):
-        DepthFusion(str(tmp_path))
-
-
-def test_worlds_without_depth_are_refused(tmp_path: Path, command_line: Cli) -> None:
-    world = tmp_path / "world"
-    simulate = [sys.executable, "-m", "slam", "simulate", str(world), "--frames", "6", "--route", "straight"]
-    subprocess.run(simulate, check=True, capture_output=True)
-    roots = ["--dataset", world, "--validation", world]
-    code, _, err = command_line(
-        main, "erfsfm", "train-fusion", *roots, "--output", tmp_path / "net", "--samples", "8", "--steps", "1"
-    )
-    assert code == 1 and "--depth" in err and len(err.strip().splitlines()) == 1

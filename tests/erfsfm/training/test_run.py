@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import logging
 import math
-import multiprocessing
 import os
 import pickle
 import shutil
@@ -23,7 +21,6 @@ import pytest
 import torch
 from torch import Tensor
 
-import erfsfm.training.run
 from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_model
 from erfsfm.common.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
 from erfsfm.common.lock import FolderLock
@@ -34,7 +31,7 @@ from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import DepthInput, ModelRecord
 from erfsfm.training.keeper import licence_of
-from erfsfm.training.module import SelfSupervision, decisive, learning_rate_factor
+from erfsfm.training.module import SelfSupervision, learning_rate_factor
 from erfsfm.training.run import train
 
 Small = dict[str, dict[str, object]]
@@ -144,31 +141,6 @@ def test_the_folder_can_be_used(both: Configure, tmp_path: Path) -> None:
     assert any(row["validation/abs_rel"] for row in rows)
 
 
-def test_five_frames_are_validated_by_the_snippet_protocol(
-    small: Small, world: Path, held_out: Path, tmp_path: Path
-) -> None:
-    small["network"]["sources"] = 4
-    config = configure(small, [held_out], training={"steps": 2}, data={"validation": ["simulated/500[0:5]"]})
-    config = config.model_copy(update={"data": config.data.model_copy(update={"ranges": {"simulated/500": "5:8"}})})
-    with pytest.raises(DataError, match="5 consecutive frames"):
-        train(config, tmp_path / "short", device="cpu")
-    config = configure(small, [held_out, world], training={"steps": 2})
-    metrics = load_model(train(config, tmp_path / "run", device="cpu")).record.metrics
-    assert {"snippet_ate", "snippet_re"} <= metrics.keys()
-
-
-def test_an_untrained_pose_network_is_written_unchanged(both: Configure, small: Small, tmp_path: Path) -> None:
-    small["network"]["normalisation"] = "batch"
-    first = train(both(), tmp_path / "first", device="cpu")
-    config = both(training={"networks": "depth", "learning_rate": 1e-3})
-    second = train(config.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
-    before, after = load_model(first), load_model(second / "last")
-    poses = zip(before.pose_net.state_dict().values(), after.pose_net.state_dict().values(), strict=True)
-    assert all(torch.equal(a, b) for a, b in poses), "its norms as well"
-    depths = zip(before.depth_net.parameters(), after.depth_net.parameters(), strict=True)
-    assert not any(torch.equal(a, b) for a, b in depths if a.numel() > 1)
-
-
 def test_two_runs_are_equal(alone: Configure, tmp_path: Path) -> None:
     config = alone(training={"steps": 2})
     for name in ("a", "b"):
@@ -233,46 +205,6 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
     torch.testing.assert_close(weights_of(tmp_path / "cut" / "last"), expected)
 
 
-@pytest.mark.parametrize("moment", ["in a step", "in the second checkpoint"])
-def test_killed_and_resumed_ends_with_identical_weights(
-    both: Configure, drives: Path, tmp_path: Path, moment: str
-) -> None:
-    """``kill -9``: no clean-up, and half a checkpoint may be on the disk."""
-    config = both(training={"steps": 6, "learning_rate": 1e-3})
-    if not (drives / "whole").exists():
-        train(config, drives / "whole", device="cpu")
-    victim = multiprocessing.get_context("fork").Process(target=die, args=(config, tmp_path / "cut", moment))
-    victim.start()
-    victim.join(120)
-    assert victim.exitcode == -signal.SIGKILL
-    train(config, tmp_path / "cut", resume=True, device="cpu")
-    assert same(drives / "whole" / "last", tmp_path / "cut" / "last")
-    assert same(drives / "whole", tmp_path / "cut")
-
-
-def die(config: ExperimentConfig, output: Path, moment: str) -> None:
-    """Train in this process until it kills itself."""
-    step, write, written = SelfSupervision.training_step, erfsfm.training.run.write_atomically, []
-
-    def dying_step(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
-        if moment == "in a step" and self.global_step == 5:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return step(self, batch, index)
-
-    def dying_write(path: Path, fill: Callable[[Path], object]) -> None:
-        def half(partial: Path) -> None:
-            fill(partial)
-            os.truncate(partial, partial.stat().st_size // 2)
-            os.kill(os.getpid(), signal.SIGKILL)
-
-        written.append(path)
-        write(path, half if moment == "in the second checkpoint" and len(written) == 2 else fill)
-
-    SelfSupervision.training_step = dying_step  # type: ignore[method-assign]
-    erfsfm.training.run.write_atomically = dying_write
-    train(config, output, device="cpu")
-
-
 def test_a_finished_run_can_be_extended(alone: Configure, tmp_path: Path) -> None:
     config = alone()
     longer = alone(training={"steps": 6})
@@ -289,17 +221,6 @@ def test_a_folder_that_another_training_writes_to_is_refused(alone: Configure, t
         with pytest.raises(BusyError, match="another process writes to"):
             train(alone(), tmp_path / "run", device="cpu")
     assert not list((tmp_path / "run").iterdir())
-
-
-def test_resuming_a_finished_run_changes_nothing(both: Configure, tmp_path: Path) -> None:
-    """In particular the best weights and their metrics are not replaced by the last."""
-    config = both(training={"learning_rate": 3.0, "gradient_clip": 1.0})
-    output = train(config, tmp_path / "run", device="cpu")
-    shutil.copytree(output, tmp_path / "before")
-    train(config, output, resume=True, device="cpu")
-    assert same(tmp_path / "before", output)
-    for name in (".", "last"):
-        assert load_model(output / name).record.metrics == load_model(tmp_path / "before" / name).record.metrics != {}
 
 
 def test_the_best_weights_stay_in_the_output_folder(
@@ -355,28 +276,6 @@ def test_a_network_that_was_never_trained_is_neither_measured_nor_written(
     joined = train(depth.model_copy(update={"initial_weights": str(output)}), tmp_path / "both", device="cpu")
     assert load_model(joined).record.networks == "both", "one trained here, the other before"
     assert {"abs_rel", "photometric", "snippet_ate"} <= load_model(joined).record.metrics.keys()
-
-
-def test_poses_without_truth_to_validate_are_the_last(
-    small: Small, world: Path, held_out: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(held_out, tmp_path / "blind")
-    (tmp_path / "blind" / "poses" / "00.txt").unlink()
-    training = {"networks": "pose", "validate_every": 1, "patience": 1}
-    roots = [world, tmp_path / "blind"]
-    config = configure(small, roots, training=training, teacher=poses_measured(world, tmp_path))
-    record = load_model(train(config, tmp_path / "run", device="cpu")).record
-    assert (record.step, record.metrics) == (4, {})
-
-
-@pytest.mark.parametrize("initial", [None, "depth"])
-def test_depth_is_not_trained_against_poses_that_never_were(
-    alone: Configure, tmp_path: Path, initial: TrainedNetworks | None
-) -> None:
-    config = alone(training={"networks": "depth"})
-    weights = str(saved(config, initial, tmp_path / "initial")) if initial else None
-    with pytest.raises(ConfigError, match="a pose network that was trained before, and there is none"):
-        train(config.model_copy(update={"initial_weights": weights}), tmp_path / "run", device="cpu")
 
 
 @pytest.mark.parametrize(
@@ -459,18 +358,6 @@ def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
     assert load_model(tmp_path / "cut" / "last").record.step == 6, "no time is left"
 
 
-def test_more_devices_than_there_are_is_one_line(alone: Configure, tmp_path: Path) -> None:
-    config = alone(training={"devices": 10_000})
-    with pytest.raises(ConfigError, match=r"training\.devices is 10000 on a machine with \d+ cores: set training"):
-        train(config, tmp_path / "run", device="cpu")
-    assert not (tmp_path / "run").exists()
-
-
-def test_several_devices_have_no_common_clock(alone: Configure) -> None:
-    with pytest.raises(ValueError, match=r"training\.minutes needs training\.devices: 1"):
-        alone(training={"minutes": 1, "devices": 2})
-
-
 @pytest.mark.parametrize(
     ("schedule", "factors"),
     [("constant", (1, 1, 1, 1)), ("step", (1, 1, 0.1, 0.1)), ("cosine", (1, 0.51, 0.163518, 0.02))],
@@ -478,19 +365,6 @@ def test_several_devices_have_no_common_clock(alone: Configure) -> None:
 def test_learning_rate_factor(schedule: str, factors: tuple[float, ...]) -> None:
     for progress, factor in zip((0, 0.5, 0.75, 1), factors):
         assert learning_rate_factor(schedule, progress) == pytest.approx(factor, abs=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("metrics", "measure"),
-    [
-        ({"abs_rel": 0.2, "photometric": 0.1}, 0.2),
-        ({"photometric": 0.1}, 0.1),
-        ({}, np.inf),
-        ({"abs_rel": np.nan, "photometric": 0.1}, np.inf),
-    ],
-)
-def test_decisive(metrics: dict[str, float], measure: float) -> None:
-    assert decisive(metrics) == measure
 
 
 def test_initial_weights_pass_on_their_leak_record_and_the_size_of_single_images(
@@ -642,15 +516,6 @@ def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path) -> None:
         train(config, tmp_path / "run", device="cpu")
 
 
-def test_a_start_that_was_interrupted_while_the_teacher_measured_goes_on(
-    alone: Configure, world: Path, tmp_path: Path
-) -> None:
-    teacher = poses_measured(world, tmp_path)
-    shutil.move(teacher.pop("cache"), tmp_path / "run" / "teacher")
-    config = alone(training={"networks": "pose", "steps": 1}, teacher=teacher)
-    assert load_model(train(config, tmp_path / "run", device="cpu")).record.step == 1
-
-
 def test_a_failed_start_leaves_nothing(alone: Configure, tmp_path: Path) -> None:
     config = alone().model_copy(update={"initial_weights": "nowhere"})
     with pytest.raises(CheckpointError):
@@ -663,17 +528,6 @@ def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
     network = config.network.model_copy(update={"pose": "erf-posenet-dilated"})
     with pytest.raises(ConfigError, match="networks"):
         train(config.model_copy(update={"network": network}), output, resume=True, device="cpu")
-
-
-@pytest.mark.parametrize(("key", "begun", "other"), [("networks", "both", "depth"), ("frozen_stages", 0, 2)])
-def test_resume_with_what_the_optimisers_state_does_not_fit(
-    cut: tuple[ExperimentConfig, Path], key: str, begun: object, other: object
-) -> None:
-    config, output = cut
-    training = config.training.model_copy(update={key: other})
-    with pytest.raises(ConfigError, match=rf"began with training\.{key} {begun}; got {other}"):
-        train(config.model_copy(update={"training": training}), output, resume=True, device="cpu")
-    assert load_experiment(output / "config.yaml") == config
 
 
 def test_resume_with_another_learning_rate(cut: tuple[ExperimentConfig, Path]) -> None:
@@ -714,21 +568,6 @@ def test_code_in_a_checkpoint_never_runs(cut: tuple[ExperimentConfig, Path], tmp
     assert not (tmp_path / "executed").exists()
 
 
-@pytest.mark.parametrize("keep", [0, 10, 0.5, -1])
-def test_a_half_written_checkpoint(cut: tuple[ExperimentConfig, Path], keep: float) -> None:
-    path = cut[1] / "checkpoints" / "last.ckpt"
-    content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * keep) if isinstance(keep, float) else keep])
-    refused_checkpoint(cut)
-
-
-def test_a_checkpoint_without_its_configuration(cut: tuple[ExperimentConfig, Path]) -> None:
-    config, output = cut
-    (output / "config.yaml").unlink()
-    with pytest.raises(TrainingError, match=r"no config\.yaml"):
-        train(config, output, resume=True, device="cpu")
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_broken_image_is_one_line(
     small: Small, tmp_path: Path, write_root: Callable[..., Path], workers: int
@@ -761,23 +600,6 @@ def test_workers_start_where_opencv_has_threads(alone: Configure, tmp_path: Path
         cv2.setNumThreads(threads)
 
 
-def test_progress_counts_the_steps_of_the_whole_run_and_lightning_prints_nothing(
-    both: Configure,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    recwarn: pytest.WarningsRecorder,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    config = both()
-    interrupted(monkeypatch, config, tmp_path / "run", 3)
-    said: list[tuple[str, int, int]] = []
-    train(config, tmp_path / "run", resume=True, device="cpu", progress=lambda *step: said.append(step))
-    assert said[-1][0].startswith("steps, loss ") and said[-1][1:] == (4, 4)
-    out, err = capfd.readouterr()
-    assert (out, err) == ("", "")
-    assert [str(w.message) for w in recwarn if "ightning" in f"{w.filename} {w.message}"] == []
-
-
 @pytest.mark.parametrize(
     ("seen", "licence"),
     [
@@ -796,33 +618,6 @@ def test_mixed_precision_trains(both: Configure, small: Small, tmp_path: Path, m
     config = both(training={"precision": "bf16-mixed", "steps": 2})
     output = train(config, tmp_path / "run", device="cpu")
     assert all(tensor.dtype != torch.bfloat16 for tensor in weights_of(output))
-
-
-@pytest.mark.parametrize(
-    ("able", "wanted", "used"),
-    [
-        ({"avx512_bf16": True}, "16-mixed", "bf16-mixed"),
-        ({"avx2": True, "avx512_bf16": False}, "16-mixed", "32-true"),
-        ({"avx2": True, "avx512_bf16": False}, "bf16-mixed", "32-true"),
-        ({"architecture": "aarch64", "bf16": True}, "bf16-mixed", None),
-    ],
-)
-def test_precision_is_that_of_the_processor_and_another_is_announced(
-    alone: Configure,
-    small: Small,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    able: dict[str, Any],
-    wanted: str,
-    used: str | None,
-) -> None:
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able)
-    small["network"] |= FOR_BFLOAT16
-    with caplog.at_level(logging.WARNING):
-        train(alone(training={"precision": wanted, "steps": 1}), tmp_path / "run", device="cpu")
-    said = [f"training.precision {wanted} does not fit this processor: {used} is used"] if used else []
-    assert [r.message for r in caplog.records if "precision" in r.message] == said
 
 
 @pytest.mark.slow
@@ -845,49 +640,3 @@ def test_two_processes_are_one_with_twice_the_batch(
     run("one", resume=True, batch=4, steps=6)
     for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # Adam divides by small moments
-
-
-@pytest.mark.slow
-def test_two_processes_stop_together_though_they_measure_different_things(
-    both: Configure, tmp_path: Path, in_processes: Callable[..., None]
-) -> None:
-    """Each has statistics of its own batches, and thus errors of its own; the first one's decide."""
-    training = {"steps": 6, "validate_every": 1, "patience": 1, "devices": 2}
-    measured = (
-        "SelfSupervision.measured = lambda self: "
-        "{'abs_rel': ([0.3, 0.2, 0.5] if self.global_rank == 0 else [0.3, 0.2, 0.1])[self.global_step - 1]}"
-    )
-    in_processes(both(training=training), tmp_path / "run", before=measured)
-    assert load_model(tmp_path / "run" / "last").record.step == 3
-    assert load_model(tmp_path / "run").record.metrics == {"abs_rel": 0.2}
-
-
-@pytest.mark.slow
-def test_two_processes_end_together_by_a_loss_of_one_that_is_not_finite(
-    both: Configure, tmp_path: Path, in_processes: Callable[..., None]
-) -> None:
-    spoiled = """
-import os
-from erfsfm.common.errors import TrainingError
-
-step, run = SelfSupervision.training_step, train
-
-def poisoned(self, batch, index):
-    if self.global_rank == self.global_step == 1:
-        batch["target"] *= float("nan")
-    return step(self, batch, index)
-
-def train(*arguments, **named):
-    try:
-        run(*arguments, **named)
-    except TrainingError as error:
-        assert "the loss at step 1 is not finite" in str(error), error
-    else:
-        raise AssertionError("trained on")
-    if os.environ.get("LOCAL_RANK") == "1":
-        sys.exit()
-
-SelfSupervision.training_step = poisoned
-"""
-    in_processes(both(training={"steps": 6, "devices": 2}), tmp_path / "run", before=spoiled)
-    assert load_model(tmp_path / "run" / "last").record.step == 1

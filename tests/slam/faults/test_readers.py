@@ -76,6 +76,10 @@ def _root(path: Path) -> Any:
     return open_sequence(path.parents[2], "sim", None, None)
 
 
+def _euroc(path: Path) -> Any:
+    return open_sequence(path.parents[2], None, None, None)
+
+
 READERS = (
     Reader("PNG", "image.png", read_image, _is_image),
     Reader("PNG of 16 bits", "depth.png", read_values),
@@ -92,6 +96,9 @@ READERS = (
     Reader("KITTI poses, training", "root/poses/sim.txt", _odometry_poses, lambda T: bool(np.isfinite(T).all())),
     Reader("TUM poses", "run/trajectory_optimised.tum.txt", read_trajectory, _is_trajectory),
     Reader("TUM images", "tum/rgb.txt", lambda path: open_sequence(path.parent, None, None, None), _is_sequence),
+    Reader("folder times", "folder/times.txt", lambda path: open_sequence(path.parent, None, None, None), _is_sequence),
+    Reader("EuRoC images", "euroc/mav0/cam0/data.csv", _euroc, _is_sequence),
+    Reader("EuRoC camera", "euroc/mav0/cam0/sensor.yaml", _euroc, _is_sequence),
     Reader("OXTS packet", "packet.txt", read_packet, lambda packet: bool(np.isfinite(packet).all())),
     Reader("metrics.json", "run/metrics.json", Metrics.read),
     Reader("loops.json", "run/loops.json", LoopsFile.read),
@@ -128,6 +135,10 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     for path in images:
         shutil.copy(path, place / "tum/rgb")
     (place / "tum/rgb.txt").write_text("".join(f"{k / 10} rgb/{path.name}\n" for k, path in enumerate(images)))
+    shutil.copytree(place / "tum/rgb", place / "folder")
+    shutil.copy(kitti_root / "camera.yaml", place / "folder")
+    (place / "folder/times.txt").write_text("".join(f"{k / 10}\n" for k in range(len(images))))
+    _write_euroc(place / "euroc/mav0/cam0", images)
     (place / "packet.txt").write_text(" ".join(["49.01", "8.43", *["0.5"] * 28]))
     (place / "split.yaml").write_text("train: [kitti_raw/a]\nvalidation: []\ntest: ['kitti_raw/b[0:10]']\n")
     shutil.copy(Path(__file__).parents[3] / "configs/erfsfm/tiny.yaml", place / "training.yaml")
@@ -147,6 +158,22 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
 def _write_old_checkpoint(path: Path) -> None:
     tensors = {f"conv{level}.0.weight": torch.ones(4, 3, 3, 3) for level in range(1, 8)}
     torch.save({"epoch": 1, "state_dict": {"conv1.0.weight": torch.ones(16, 3, 7, 7)} | tensors}, path)
+
+
+def _write_euroc(camera: Path, images: list[Path]) -> None:
+    (camera / "data").mkdir(parents=True)
+    rows = ["#timestamp [ns],filename"]
+    for k, path in enumerate(images):
+        shutil.copy(path, camera / f"data/{10**18 + k * 10**8}.png")
+        rows.append(f"{10**18 + k * 10**8},{10**18 + k * 10**8}.png")
+    (camera / "data.csv").write_text("\n".join(rows))
+    height, width = cv2.imread(str(images[0])).shape[:2]
+    pose = "T_BS:\n  cols: 4\n  rows: 4\n  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+    lens = "camera_model: pinhole\nintrinsics: [60, 60, 47, 31]\ndistortion_model: radial-tangential\n"
+    lens += "distortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
+    (camera / "sensor.yaml").write_text(
+        f"sensor_type: camera\n{pose}rate_hz: 10\nresolution: [{width}, {height}]\n{lens}"
+    )
 
 
 @pytest.fixture

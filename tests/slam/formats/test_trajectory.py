@@ -75,26 +75,6 @@ def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str
     assert back.timed
 
 
-def test_files_look_as_their_formats_say(tmp_path: Path) -> None:
-    one = Trajectory(np.array([0.1]), read_trajectory(written(tmp_path, KITTI)).T_world_camera)
-    write_kitti(tmp_path / "kitti.txt", one)
-    row = (tmp_path / "kitti.txt").read_text()
-    assert row.startswith("1.000000000e+00 0.000000000e+00 ")
-    assert row.endswith(" 3.500000000e+00\n")
-    assert len(row.split(" ")) == 12
-    write_tum(tmp_path / "tum.txt", one)
-    comment, row = (tmp_path / "tum.txt").read_text().splitlines()
-    assert comment.startswith("#")
-    assert row.split(" ")[0] == "0.100000000"
-    assert row.split(" ")[7] == "1.000000000e+00"
-
-
-def test_comments_blank_lines_and_windows_files(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_bytes(b"\xef\xbb\xbf# stamp tx ...\r\n\r\n0 0 0 0 0 0 0 1\r\n 1 0 0 1 0 0 0 1 \r\n")
-    np.testing.assert_array_equal(read_trajectory(path).stamps, [0.0, 1.0])
-
-
 @pytest.mark.parametrize(
     ("text", "format", "words"),
     [
@@ -126,30 +106,6 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, format: str, words
 @pytest.mark.parametrize("row", ["1.0003 0 0 0 0 0.9998 0.0002 0 0 0 1 0", "0 0 0 0 0 0 0.7071 0.7071"])
 def test_rounded_rotations_are_repaired(tmp_path: Path, row: str) -> None:
     assert se3.is_se3(read_trajectory(written(tmp_path, row)).T_world_camera, tolerance=1e-12)
-
-
-def test_what_is_no_text_file(tmp_path: Path) -> None:
-    with pytest.raises(TrajectoryError, match="no such file"):
-        read_trajectory(tmp_path / "missing.txt")
-    with pytest.raises(TrajectoryError, match="folder"):
-        read_trajectory(tmp_path)
-    (tmp_path / "poses.npy").write_bytes(b"\x93NUMPY\xff\xfe\x00")
-    with pytest.raises(TrajectoryError, match="not a text file"):
-        read_trajectory(tmp_path / "poses.npy")
-
-
-def test_writing_is_atomic_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    write_kitti(path, wander(3))
-    write_kitti(path, wander(5))
-    assert len(read_trajectory(path)) == 5
-    assert [each.name for each in tmp_path.iterdir()] == ["poses.txt"]
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(TrajectoryError, match="cannot be written"):
-        write_tum(tmp_path / "folder", wander(3))
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["folder", "poses.txt"]
-    with pytest.raises(TrajectoryError, match="cannot be written"):
-        write_tum(path / "below.txt", wander(3))
 
 
 def test_untimed_trajectories_match_row_by_row() -> None:

@@ -96,13 +96,6 @@ def test_a_straight_drive_has_no_loop() -> None:
     assert result.loops.accepted == () and result.loops.candidates > 0
 
 
-def test_switched_off_the_summary_has_the_reason() -> None:
-    result = run(drive("straight", 20, 620), "loops.enabled=false")
-    summary = result.loops.summary()
-    assert summary["candidates"] is None and "loops.enabled" in summary["candidates_reason"]
-    assert result.drive.views == []
-
-
 def test_features_are_spread_and_bounded() -> None:
     sequence = drive("straight", 20, 621)
     extractor = FeatureExtractor(sequence.intrinsics)
@@ -116,9 +109,3 @@ def test_features_are_spread_and_bounded() -> None:
     assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
     blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
     assert len(blank) == 0
-
-
-def test_no_views_no_loops() -> None:
-    sequence = drive("straight", 20, 621)
-    closures = close_loops([], sequence.reference, sequence.intrinsics, LoopsConfig(), is_metric=False)
-    assert closures.candidates == 0 and closures.accepted == ()

@@ -71,16 +71,3 @@ def test_candidates_are_few_and_apart() -> None:
         earlier = [c.earlier for c in found if c.later == later]
         assert len(earlier) <= 2
         assert len(earlier) < 2 or abs(earlier[0] - earlier[1]) > 10
-
-
-@pytest.mark.parametrize("count", [0, 1, 30])
-def test_images_without_corners(count: int) -> None:
-    blank = [view(k, np.zeros((0, 32), np.uint8)) for k in range(count)]
-    assert find_candidates(blank, np.arange(float(count)), 15.0) == []
-
-
-def test_blank_frames_among_others_are_no_candidates() -> None:
-    views = drive(20, 5)
-    views[3] = views[44] = view(views[3].index, np.zeros((0, 32), np.uint8))
-    found = find_candidates(views, np.arange(50.0), 15.0)
-    assert not {3, 44} & {row for c in found for row in (c.earlier, c.later)}

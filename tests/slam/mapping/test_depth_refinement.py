@@ -37,10 +37,6 @@ def test_the_last_keyframe_has_its_neighbours_before_it() -> None:
     assert set(read) == {17, 18, 19}
 
 
-def test_a_standing_camera_has_no_neighbours() -> None:
-    assert refiner(np.zeros(20), []).refine(10, DEPTH, None) is None
-
-
 def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasured() -> None:
     holes = DEPTH.copy()
     holes[10:20, 20:40] = 0
@@ -50,7 +46,3 @@ def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasur
     unmeasured = ~(np.isfinite(holes) & (holes > 0)) & ~refined.measured
     assert unmeasured.any() and np.isinf(refined.relative_sigma[unmeasured]).all()
     assert np.isfinite(refined.relative_sigma[~unmeasured]).all()
-
-
-def test_depth_that_is_unknown_everywhere_is_not_refined() -> None:
-    assert refiner(np.arange(20.0), []).refine(10, np.zeros_like(DEPTH), None) is None

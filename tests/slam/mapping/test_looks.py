@@ -6,7 +6,7 @@ import pytest
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
 from slam.mapping.colours import evened
-from slam.mapping.filters import FILTERS, DepthFilters, KeyframeDepth
+from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.holes import with_holes_closed
 from slam.mapping.map import TsdfMap
 from slam.mapping.tile_surface import TileSurface
@@ -35,13 +35,6 @@ def test_a_view_without_depth_paints_nothing_right_before_it():
     mesh = tsdf_map.mesh()
     plate = mesh.colours[(np.abs(mesh.points[:, :2]) < 0.15).all(axis=1)]
     assert len(plate) and plate[:, 1].max() < 25
-
-
-@pytest.mark.parametrize("per_metre", [0.125, 8.0])
-def test_a_map_in_another_unit_has_the_same_colours(street_map, per_metre):
-    metres, other = street_map().mesh(), street_map(per_metre=per_metre).mesh()
-    np.testing.assert_allclose(other.points, per_metre * metres.points, rtol=1e-6)
-    np.testing.assert_array_equal(other.colours, metres.colours)
 
 
 def test_brightness_steps_become_small_gains():
@@ -77,37 +70,6 @@ def test_only_holes_that_look_upwards_are_closed(up: tuple[float, float, float],
     np.testing.assert_allclose(full.vertices[36:], np.tile([1.5, 1.5, 1.0], (closed, 1)))
     normals = np.cross(*(full.vertices[full.triangles[:, k]] - full.vertices[full.triangles[:, 0]] for k in (1, 2)))
     assert (normals[:, 2] > 0).all()
-
-
-def test_each_filter_counts_what_it_took():
-    camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
-    depth = np.full((50, 100), 10.0, np.float32)
-    depth[:, 90:] = 0
-    depth[:, 80:90] = 40.0
-    sigma = np.full(depth.shape, 0.05, np.float32)
-    sigma[:, :20] = 0.5
-    image = np.full((50, 100, 3), 90, np.uint8)
-    image[10:30, 30:40] = 250  # bright: sky above the horizon at row 24.5
-    image[10:15, 40:50] = (100, 120, 140)
-    image[12:18, 60:70] = 250  # a window: in one piece with nothing at the upper border, whose last row is 10
-    config = MappingConfig(border=0.1, hood_crop=0.2, max_relative_sigma=0.2)
-    filters = DepthFilters(config, camera)
-    kept = filters.kept(KeyframeDepth(0, depth, sigma, image, np.eye(4)), ())
-    shares = filters.shares()
-    assert tuple(shares) == FILTERS
-    assert shares["unknown"] == pytest.approx(0.1)
-    assert shares["border"] == pytest.approx(0.1 + 0.8 * 0.2)  # 10 columns on the left, 10 rows of the other 80
-    assert shares["bonnet"] == pytest.approx(0.8 * 0.2)
-    assert shares["sky"] == pytest.approx((14 * 10 + 5 * 10) / 5000)
-    assert shares["range"] == pytest.approx(0.1 * 0.6) and shares["sigma"] == pytest.approx(0.1 * 0.6)
-    assert 1 - sum(shares.values()) == pytest.approx((kept > 0).mean())
-
-
-def test_a_camera_that_looks_down_sees_no_sky():
-    filters = DepthFilters(MappingConfig(), Intrinsics(100, 50, 80.0, 80.0, 49.5, 0.5))
-    bright = np.full((50, 100, 3), 250, np.uint8)
-    filters.kept(KeyframeDepth(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), ())
-    assert filters.shares()["sky"] == 0
 
 
 def test_how_far_depth_is_fused_depends_on_its_sigma():

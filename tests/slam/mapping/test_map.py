@@ -81,16 +81,6 @@ def test_one_wall_lands_where_the_camera_saw_it():
     np.testing.assert_allclose(tsdf_map.mesh().colours, 128, atol=3)
 
 
-def test_one_wall_from_a_rotated_camera():
-    tsdf_map = TsdfMap(MappingConfig(min_weight=2, min_component_triangles=10), CAMERA)
-    for x in (0.0, 0.5, 1.0):
-        tsdf_map.integrate(KeyframeDepth(0, plate(8.05 - x), None, GREY, pose(x, 0.0, 3.0, yaw=np.pi / 2)))
-    cloud = tsdf_map.cloud()
-    np.testing.assert_allclose(cloud.points[:, 0], 8.05, atol=0.003)
-    np.testing.assert_allclose(cloud.points[:, 2].mean(), 3.0, atol=0.1)
-    assert np.abs(cloud.normals[:, 0]).min() > 0.99
-
-
 def test_slanted_surfaces_have_no_pixel_bias():
     # without Open3D's half pixel the road comes out 4 cm low
     vertices = street_map().mesh().points
@@ -120,17 +110,6 @@ def test_thinned_depth_is_not_shifted(width):
     assert np.isfinite(kept[rays[..., 1] > 0.05]).all()
     heights = (rays[..., 1] * kept)[(kept > 3) & (kept < 20)]
     assert np.abs(np.median(heights) / 1.65 - 1) < 0.001
-
-
-@pytest.mark.parametrize("width", [70, 104])
-def test_thinning_invents_no_depth_across_edges_and_beside_unknown_pixels(width):
-    rng = np.random.default_rng(0)
-    blocks = rng.choice([0.0, 5.0, 9.0], (16, 52)).repeat(4, axis=0).repeat(4, axis=1)[:64, :208]
-    depth = np.where(rng.random(blocks.shape) < 0.1, np.nan, blocks).astype(np.float32)
-    kept = Keyframe.of(Frame(0, 0.0, GREY), depth, SpillFile(), MappingConfig(width_px=width)).depth_unscaled
-    assert set(np.unique(kept[kept > 0])) == {5, 9}
-    of_each = [np.mean(np.isnan(d) | (d == 0)) for d in (kept, depth)]
-    assert of_each[0] == pytest.approx(of_each[1], abs=0.02)
 
 
 def test_depth_inconsistent_between_views_is_left_out():
@@ -192,37 +171,6 @@ def test_files_are_written_whole_and_read_back(tmp_path):
     np.testing.assert_array_equal(np.asarray(mesh.triangles), whole.triangles)
     np.testing.assert_array_equal(read_ply(tmp_path / "mesh.ply").vertices, whole.vertices)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.ply", "mesh.ply"]
-
-
-def test_empty_maps_say_so_and_do_not_crash(tmp_path):
-    empty = TsdfMap(MappingConfig(), CAMERA)
-    sky = TsdfMap(MappingConfig(), CAMERA)
-    for k in range(4):
-        sky.integrate(KeyframeDepth(0, np.full(V.shape, 80.0, np.float32), None, GREY, pose(0.0, 0.0, float(k))))
-    unknown = TsdfMap(MappingConfig(), CAMERA)
-    for k in range(4):
-        unknown.integrate(KeyframeDepth(0, np.full(V.shape, np.nan, np.float32), None, GREY, pose(0.0, 0.0, float(k))))
-    all_small = street_map(min_component_triangles=10**9)
-    never_enough = TsdfMap(MappingConfig(), CAMERA)
-    for k in range(5):  # every view sees another place
-        never_enough.integrate(KeyframeDepth(0, street(np.zeros(3)), None, GREY, pose(500.0 * k, 0.0, 0.0)))
-    for tsdf_map in (empty, sky, unknown, all_small, never_enough):
-        with pytest.raises(SlamError, match="the map is empty"):
-            tsdf_map.surface().write_mesh(tmp_path / "mesh.ply")
-        assert tsdf_map.statistics().triangles == 0
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("first", "size", "fused"), [(4, 5, 0), (4, 6, 1), (59, 6, 0)])
-def test_a_frame_with_hardly_any_depth_left_is_skipped(first: int, size: int, fused: int):
-    """Open3D raises where no pixel of its coarse grid has depth; the border of a patch counts as an edge."""
-    depth = np.zeros((CAMERA.height - 1, CAMERA.width), np.float32)
-    depth[first : first + size, 4:20] = 8.0
-    camera = Intrinsics(CAMERA.width, CAMERA.height - 1, 120.0, 120.0, 103.5, 31.5)
-    tsdf_map = TsdfMap(MappingConfig(), camera)
-    tsdf_map.integrate(KeyframeDepth(0, depth, None, GREY[:-1], pose(0.0, 0.0, 0.0)))
-    tsdf_map.statistics()
-    assert tsdf_map.statistics().frames_fused == fused
 
 
 def test_a_map_goes_on_after_its_surface_was_asked_for():

@@ -3,13 +3,11 @@
 from collections import Counter
 
 import numpy as np
-import pytest
 
 from slam.config.sections import MappingConfig
 from slam.mapping.merged_submaps import TILE_BLOCKS, MergedSubmaps
-from slam.mapping.submap import BLOCK_SIDE, Submap, remove_submaps, submap_paths
+from slam.mapping.submap import BLOCK_SIDE, remove_submaps, submap_paths
 from slam.mapping.surface import MapSurface
-from slam.runtime.errors import RunError
 from slam.runtime.run_files import SUBMAPS
 
 
@@ -58,13 +56,3 @@ def test_finished_submaps_outlive_the_process_that_made_them(street_map, tmp_pat
     assert surface.triangles > 1000 and MergedSubmaps(paths).fused < 18
     remove_submaps(tmp_path / SUBMAPS)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_damaged_submap_is_one_line(street_map, tmp_path):
-    street_map(tmp_path, submap_m=5.0)
-    path = submap_paths(tmp_path / SUBMAPS)[0]
-    path.write_bytes(path.read_bytes()[:-1000])
-    with pytest.raises(RunError, match=r"submap_00000\.npz is damaged"):
-        Submap.read(path)
-    with pytest.raises(RunError, match=r"submap_00000\.npz is damaged"):
-        MapSurface([path], MappingConfig())

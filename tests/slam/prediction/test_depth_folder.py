@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -72,15 +70,6 @@ def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path)
         source.disparity(frame(3))
 
 
-def test_what_is_no_depth_is_unknown(tmp_path: Path) -> None:
-    values = np.full((HEIGHT, WIDTH), 4.0)
-    values[0, :6] = [np.nan, np.inf, -np.inf, 0.0, -2.0, 1e300]
-    np.save(tmp_path / "0.npy", values)
-    disparity = opened(tmp_path, FrameNumbers(1, 0, 1)).disparity(frame(0))
-    assert disparity is not None and disparity.dtype == np.float32
-    assert np.isnan(disparity[0, :6]).all() and (disparity[1:] == 0.25).all()
-
-
 @pytest.mark.parametrize(("scale", "value"), [(256.0, 10.0), (1000.0, 2.56)])
 def test_pictures_of_16_bits_have_a_scale_and_zero_is_unknown(tmp_path: Path, scale: float, value: float) -> None:
     picture = np.full((HEIGHT, WIDTH), 2560, np.uint16)
@@ -104,52 +93,3 @@ def test_the_digest_is_of_names_and_content(tmp_path: Path) -> None:
     assert opened(copy, numbers).sha256 == first
     np.save(copy / "1.npy", np.full((HEIGHT, WIDTH), 2.5, np.float32))
     assert opened(copy, numbers).sha256 != first
-
-
-def write_png(path: Path, picture: np.ndarray) -> None:
-    cv2.imwrite(str(path), picture)
-
-
-def written(array: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array)
-    return file.getvalue()
-
-
-BAD: dict[str, tuple[str, Any, str]] = {
-    "integers": ("npy", np.ones((HEIGHT, WIDTH), np.int32), r"must hold floats of shape \(H, W\); got int32"),
-    "colour": ("npy", np.ones((HEIGHT, WIDTH, 3), np.float32), r"must hold floats .* got float32 \(12, 40, 3\)"),
-    "flat": ("npy", np.ones(HEIGHT, np.float32), "must hold floats of shape"),
-    "empty": ("npy", np.ones((0, WIDTH), np.float32), "must hold floats of shape"),
-    "objects": ("npy", np.array([[print]], object), "Python objects, which are not loaded"),
-    "other size": ("npy", np.ones((HEIGHT, WIDTH + 1), np.float32), "is 41x12, the depth before it 40x12"),
-    "8 bits": ("png", np.ones((HEIGHT, WIDTH), np.uint8), "grey picture of 8 bits"),
-    "a picture": ("png", np.ones((HEIGHT, WIDTH, 3), np.uint8), "colour picture of 8 bits"),
-    "text": ("npy", b"hello", "is no .npy array"),
-    "half": ("npy", written(np.ones((HEIGHT, WIDTH), np.float32))[:-100], "truncated"),
-    "huge": ("png", b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBB", 13, b"IHDR", 30_000, 30_000, 16, 0), "more pixels"),
-    "text.": ("png", b"hello", "is no PNG"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_files_that_are_no_depth_are_found_before_the_run(tmp_path: Path, name: str) -> None:
-    kind, content, message = BAD[name]
-    for k in range(1 if name == "huge" else 0, 3):
-        path = tmp_path / f"{k}.{kind}"
-        if k == 1 and isinstance(content, bytes):
-            path.write_bytes(content)
-        elif kind == "npy":
-            np.save(path, content if k == 1 else np.ones((HEIGHT, WIDTH), np.float32), allow_pickle=True)
-        else:
-            write_png(path, content if k == 1 else np.ones((HEIGHT, WIDTH), np.uint16))
-    with pytest.raises(SlamError, match=message) as caught:
-        opened(tmp_path, FrameNumbers(*((2, 0, 2) if name == "huge" else (3, 0, 3))), kind)
-    assert f"1.{kind}" in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("kind", "words"), [("npy", "write rows as rows"), ("png", r"holds no \.png file")])
-def test_folders_that_do_not_fit_are_one_line(tmp_path: Path, kind: str, words: str) -> None:
-    np.save(tmp_path / "0.npy", np.ones((WIDTH, HEIGHT), np.float32))
-    with pytest.raises(SlamError, match=words):
-        opened(tmp_path, FrameNumbers(1, 0, 1), kind)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
-from slam.prediction.depth_source import Disparity, SourcedPredictor, at_size, disparity_of, known_only, mixed_sha256
-from slam.runtime.errors import SlamError
+from slam.prediction.depth_source import Disparity, SourcedPredictor, at_size, mixed_sha256
 
 HEIGHT, WIDTH = 40, 96
 # disparity of a road below a far wall, in the networks' unit
@@ -101,11 +100,6 @@ def test_frames_from_before_the_source_take_the_unit_of_those_that_follow() -> N
     np.testing.assert_allclose(shifts(predictor(Source(0.5, absent=4)).snippet(frames())), 2.0, rtol=1e-5)
 
 
-def test_a_snippet_without_any_depth_is_one_error() -> None:
-    with pytest.raises(SlamError, match="frames 0 to 4 have no known depth in npy:depth"):
-        predictor(Source(unknown=(0, 1, 2, 3, 4))).snippet(frames())
-
-
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (10, 24), (80, 192), (20, 190)])
 def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(size: tuple[int, int]) -> None:
     rows = (np.arange(size[0]) + 0.5) / size[0]
@@ -117,13 +111,6 @@ def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(size: tup
     half = at_size(plane, HEIGHT, WIDTH)
     np.testing.assert_allclose(half[4:-4, WIDTH // 2 + 6 :], wanted[4:-4, WIDTH // 2 + 6 :], rtol=0.02)
     assert np.isnan(half[:, : WIDTH // 2 - 6]).all() and half.dtype == np.float32
-
-
-def test_known_values_have_a_finite_inverse() -> None:
-    values = np.array([1.0, 0.0, -1.0, np.nan, np.inf, 1e-45, 1e300])
-    np.testing.assert_array_equal(np.isfinite(known_only(values)), [True] + [False] * 6)
-    np.testing.assert_array_equal(disparity_of(np.array([4.0, 0.0]), "depth"), [0.25, np.nan])
-    np.testing.assert_array_equal(disparity_of(np.array([4.0, 0.0]), "disparity"), [4.0, np.nan])
 
 
 def test_the_identity_of_networks_alone_is_that_of_their_weights() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -79,19 +78,6 @@ def test_residuals_are_the_same_whether_the_depth_of_the_target_was_asked_for_be
     known, read_again = predictor.snippet(snippet), predictor.snippet(again(snippet))
     assert known.residuals is not None and read_again.residuals is not None
     np.testing.assert_array_equal(read_again.residuals, known.residuals)
-
-
-def test_a_snippet_without_residuals_asks_for_no_depth() -> None:
-    networks, snippet = Counting(), frames(0)
-    assert NetworkPredictor(networks, CAMERA).snippet(snippet, with_residuals=False).residuals is None
-    assert networks.asked == 1
-
-
-def test_the_executor_is_one_thread_that_ends_with_its_user(direct: DepthPosePredictor) -> None:
-    with NetworkPredictor(direct, CAMERA).executor() as executor:
-        names = {executor.submit(lambda: threading.current_thread().name).result() for _ in range(4)}
-        assert names == {"networks_0"}
-    assert not {thread.name for thread in threading.enumerate()} & names
 
 
 class Answered(NamedTuple):

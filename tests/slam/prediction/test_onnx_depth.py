@@ -29,15 +29,6 @@ def image(value: int = 51, height: int = 16, width: int = 32) -> Image:
     return np.full((height, width, 3), value, np.uint8)
 
 
-@pytest.mark.parametrize(
-    "shape", [(1, 3, 16, 32), ("batch", 3, 16, 32), (1, 16, 32, 3), (3, 16, 32), (16, 32, 3), (1, 3, 16, "width")]
-)
-def test_images_of_every_layout_are_taken(make_network: MakeNetwork, shape: tuple[Any, ...]) -> None:
-    source = opened(make_network(shape=shape), width=32 if shape[-1] == "width" else 0)
-    np.testing.assert_allclose(source.infer(image(51)), np.full((16, 32), 0.2), rtol=1e-6)
-    np.testing.assert_allclose(source.disparity(Frame(0, 0.0, image(51))), np.full((16, 32), 5.0), rtol=1e-6)
-
-
 def test_mean_and_deviation_of_each_channel(make_network: MakeNetwork) -> None:
     source = opened(make_network(), mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
     pixel = np.array([100, 150, 200], np.uint8)
@@ -65,28 +56,6 @@ def test_depth_and_disparity_are_told_apart_and_unknown_pixels_stay_unknown(make
     assert np.isnan(far) and near == pytest.approx(0.5)
     for shift in (np.nan, np.inf, -3.0):
         assert np.isnan(opened(make_network("bad.onnx", shift=shift)).disparity(frame)).all()
-
-
-@pytest.mark.parametrize(
-    ("made", "settings", "parts"),
-    [
-        ({"shape": (1, 1, 16, 32)}, {}, ["one input", "RGB image", "[1, 1, 16, 32]"]),
-        ({"shape": (4, 3, 16, 32)}, {}, ["one input", "[4, 3, 16, 32]"]),
-        ({"kind": 11}, {}, ["one input", "tensor(double)"]),
-        ({"shape": (1, 3, "h", "w")}, {}, ["any size", "depth.height and depth.width"]),
-        ({}, {"height": 32}, ["height 16, not 32", "leave depth.height out"]),
-        ({"outputs": 2}, {}, ["2 outputs", "depth.output_name", "depth, scaled"]),
-        ({}, {"output_name": "uncertainty"}, ["no output uncertainty", "one of depth"]),
-        ({}, {"kind": "auto", "mean": None}, ["depth.kind=", "depth.mean=[0.485,0.456,0.406]"]),
-        ({"operator": "Mystery"}, {}, ["cannot be run by onnxruntime", "own operators alone"]),
-    ],
-)
-def test_what_does_not_fit_is_one_line(
-    make_network: MakeNetwork, made: dict[str, Any], settings: dict[str, Any], parts: list[str]
-) -> None:
-    with pytest.raises(SlamError) as caught:
-        opened(make_network(**made), **settings)
-    assert "\n" not in str(caught.value) and all(part in str(caught.value) for part in ["net.onnx", *parts])
 
 
 def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: MakeNetwork) -> None:

@@ -25,11 +25,6 @@ def test_one_is_read_while_another_is_used() -> None:
     assert list(numbers) == [50, 60, 70] and begun == [4, 5, 6, 7]
 
 
-def test_nothing_and_one_are_read_too() -> None:
-    assert list(read_ahead(str, range(3, 3))) == []
-    assert list(read_ahead(str, range(3, 4))) == ["3"]
-
-
 def test_two_threads_read_at_once_and_in_order() -> None:
     both = Barrier(2)
 

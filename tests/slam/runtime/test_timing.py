@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from slam.runtime.timing import Stopwatch, peak_rss_mb
+from slam.runtime.timing import Stopwatch
 
 
 def test_a_stage_adds_up_over_its_visits_also_when_it_fails() -> None:
@@ -29,11 +29,3 @@ def test_processor_time_is_work_not_waiting() -> None:
     waited = watch.cpu_seconds
     assert waited < watch.seconds
     assert any(watch.cpu_seconds > waited for _ in range(10**7))
-
-
-def test_peak_memory_is_in_mebibytes_and_never_falls() -> None:
-    before = peak_rss_mb()
-    assert 20 < before < 100_000
-    block = bytearray(64 * 2**20)
-    block[::4096] = b"x" * len(block[::4096])
-    assert peak_rss_mb() >= before

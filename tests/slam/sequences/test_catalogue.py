@@ -36,50 +36,6 @@ def test_sequence_without_images_says_so(tmp_path: Path, odometry) -> None:
         open_sequence(tmp_path, "09", None, None)
 
 
-def test_environment(tmp_path: Path, odometry, monkeypatch: pytest.MonkeyPatch) -> None:
-    odometry(tmp_path / "kitti", name="09")
-    monkeypatch.chdir(tmp_path)
-    for dataset in (None, Path("KITTI")):
-        with pytest.raises(SequenceError, match=r"sequence 09 is looked for in \$KITTI_ODOMETRY, which is not set"):
-            open_sequence(dataset, "09", None, None)
-    monkeypatch.setenv("KITTI_ODOMETRY", str(tmp_path / "kitti"))
-    assert open_sequence(None, "09", None, None).name == "09"
-    assert open_sequence(Path("KITTI"), "09", None, None).name == "09"
-    assert open_sequence(Path("KITTI"), None, None, None).name == "09"
-    monkeypatch.setenv("KITTI_ODOMETRY", str(tmp_path / "nowhere"))
-    with pytest.raises(SequenceError, match=r"no data set at .*nowhere \(\$KITTI_ODOMETRY\)"):
-        open_sequence(None, "09", None, None)
-
-
-@pytest.mark.parametrize(
-    "content, message",
-    [
-        ([], "is no data set: .*found an empty folder"),
-        (["a.txt", "b.txt"], "is no data set: looked for .*found a.txt, b.txt"),
-        (["sequences/00/calib.txt"], "no sequence with images under .*sequences.*found 00"),
-        ([f"{k}.txt" for k in range(12)], "and 4 more"),
-        (["2011_09_26_drive_0013_extract/x"], "is no data set"),
-    ],
-)
-def test_unknown_folders(tmp_path: Path, content: list[str], message: str) -> None:
-    for name in content:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("")
-    with pytest.raises(SequenceError, match=message):
-        open_sequence(tmp_path, None, None, None)
-
-
-def test_unknown_paths(tmp_path: Path, camera_yaml: str) -> None:
-    with pytest.raises(SequenceError, match=r"no data set at .*nowhere: check the path"):
-        open_sequence(tmp_path / "nowhere", None, None, None)
-    (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(SequenceError, match=r"notes\.txt is no video \(mp4, avi, mov, mkv\)"):
-        open_sequence(tmp_path / "notes.txt", None, None, None)
-    (tmp_path / "camera.yaml").write_text(camera_yaml)
-    with pytest.raises(SequenceError, match="without a data set"):
-        open_sequence(None, None, tmp_path / "camera.yaml", None)
-
-
 def test_name_of_a_folder_inside(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path / "mine", ["0.png", "1.png"])
     (tmp_path / "mine" / "camera.yaml").write_text(camera_yaml)

@@ -7,14 +7,10 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from slam.commands.cli import main
-from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.options import SimulationOptions
-from slam.simulation.street import SimulatedStreet
 
 Call = Callable[..., tuple[int, str]]
 SETTINGS = ["--set", "mapping.enabled=false", "--set", "output.report=false"]
@@ -44,33 +40,10 @@ def metrics(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def write_folder(folder: Path, kitti_root: Path, suffix: str = ".png") -> Path:
-    """The pictures of ``kitti_root`` as a user's own folder."""
-    folder.mkdir()
-    for path in (kitti_root / "sequences/sim/image_2").iterdir():
-        cv2.imwrite(str(folder / f"{path.stem}{suffix}"), cv2.imread(str(path)))
-    shutil.copy(kitti_root / "camera.yaml", folder)
-    return folder
-
-
 def write_kitti(root: Path, name: str, kitti_root: Path) -> Path:
     """The same as a sequence of the real odometry benchmark."""
     shutil.copytree(kitti_root / "sequences/sim", root / "sequences" / name)
     return root
-
-
-def test_a_folder_with_brackets_in_its_name(
-    tmp_path: Path, kitti_root: Path, run: Call, write_weights: Callable[..., Path]
-) -> None:
-    write_folder(tmp_path / "br[ack]ets", kitti_root)
-    given = ("--dataset", "br[ack]ets", "--camera", "br[ack]ets/camera.yaml", "--frames", "0:8")
-    code, err = run(*given, "--output", "o[u]t")
-    assert code == 0, err
-    assert (metrics(tmp_path / "o[u]t")["sequence"]["name"]) == "br[ack]ets"
-    for trained_on, leak in (("folder/br[ack]ets[7:20]", True), ("folder/br[ack]ets[8:20]", False)):
-        weights = write_weights(tmp_path / f"weights-{leak}", (trained_on,))
-        code, err = run(*given, "--weights", weights, "--output", f"leak-{leak}")
-        assert code == 0 and metrics(tmp_path / f"leak-{leak}")["provenance"]["leak"] is leak, err
 
 
 def test_a_gap_in_the_numbering_has_rows_in_the_trajectories(tmp_path: Path, kitti_root: Path, run: Call) -> None:
@@ -98,24 +71,3 @@ def test_a_drive_goes_on_after_a_gap_and_not_with_another_one(tmp_path: Path, ki
     found = metrics(tmp_path / "on")["sequence"]
     assert found["frames"] == 14 and [(gap["first"], gap["last"]) for gap in found["bridged"]] == [(6, 7)]
     assert len(np.loadtxt(tmp_path / "on/trajectory_optimised.tum.txt")) == 14
-
-
-def test_a_copy_of_another_drive_under_the_same_name_is_noticed(tmp_path: Path, kitti_root: Path, run: Call) -> None:
-    root = write_kitti(tmp_path / "root", "00", kitti_root)
-    options = SimulationOptions(route="straight", frames=14, seed=1002, width=208, height=64)
-    write_kitti_root(SimulatedStreet(options), tmp_path / "street")
-    other = write_kitti(tmp_path / "other", "00", tmp_path / "street")
-    assert run("--dataset", root, "--sequence", "00", "--frames", "0:6", "--output", "begun")[0] == 0
-    for dataset, lines in ((other, 1), (root, 0)):
-        following = ("--dataset", dataset, "--sequence", "00", "--frames", "6:")
-        code, err = run(*following, "--continue", "begun", "--output", f"on_{dataset.name}")
-        assert code == 0 and err.count("frame 6, the first that follows, does not match frame 5 (") == lines
-
-
-def test_a_recording_that_ends_frozen_is_reported(tmp_path: Path, kitti_root: Path, run: Call) -> None:
-    root = write_kitti(tmp_path / "root", "00", kitti_root)
-    images = root / "sequences/00/image_2"
-    for k in range(10, 14):
-        shutil.copy(images / "000009.png", images / f"{k:06d}.png")
-    code, err = run("--dataset", root, "--sequence", "00", "--output", "out")
-    assert code == 0 and "frames 10 to 13, the last ones, repeat frame 9: the camera is taken to stand" in err

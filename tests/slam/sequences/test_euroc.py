@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.commands.doctor import examine
-from slam.runtime.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import MissingFrameError
 from slam.sequences.catalogue import open_sequence
 
 FIRST_NS, STEP_NS, FRAMES = 1403715273262142976, 50_000_000, 6
@@ -62,11 +61,6 @@ def test_opens(flight: Path, given: str) -> None:
     assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(FRAMES), [1, 0, 0]), abs=1e-6)
 
 
-def test_the_doctor_names_it(flight: Path) -> None:
-    line = examine(flight.parent)[-1]
-    assert line.startswith("ok       sequence MH_07: 6 frames of 40x24, no true poses") and line.endswith("(EuRoC)")
-
-
 def test_true_poses_of_some_frames_are_those_of_an_excerpt(flight: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_truth(flight, 3, FRAMES)
     with caplog.at_level(logging.WARNING):
@@ -103,35 +97,6 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
     (flight.parent / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.2\n")
     sequence = open_sequence(flight)
     assert sequence.camera_height_m == 1.2 and sequence.intrinsics.fx != 30
-
-
-@pytest.mark.parametrize(
-    "name, old, new, message",
-    [
-        ("sensor.yaml", "radial-tangential", "omni", "distortion_model omni: known are .*give --camera"),
-        ("sensor.yaml", "rate_hz: 20\n", "", "needs resolution, intrinsics .* and rate_hz: KeyError"),
-        ("sensor.yaml", "[30, 30, 20, 12]", "[30, 30, 200, 12]", r"sensor\.yaml: cx, cy: \(200, 12\) lies outside"),
-        ("sensor.yaml", "T_BS", "T_SB", "needs T_BS with data of 4 x 4 numbers"),
-        ("sensor.yaml", "rate_hz: 20", "rate_hz: !!python/object/apply:os.getcwd []", "could not determine"),
-        ("data.csv", f"{FIRST_NS},", "soon,", "'soon' where a stamp in nanoseconds belongs"),
-        ("data.csv", f"{FIRST_NS},", f"{FIRST_NS + STEP_NS},", "row 2: stamps must be numbers that increase"),
-    ],
-)
-def test_damage(flight: Path, name: str, old: str, new: str, message: str) -> None:
-    path = flight / "cam0" / name
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new, 1))
-    write_truth(flight, 0, FRAMES)
-    with pytest.raises(SequenceError, match=message) as caught:
-        open_sequence(flight)
-    assert "\n" not in str(caught.value)
-
-
-def test_without_its_images(flight: Path) -> None:
-    for path in (flight / "cam0/data").iterdir():
-        path.unlink()
-    with pytest.raises(SequenceError, match=r"none of the 6 images that .* names is there"):
-        open_sequence(flight)
 
 
 @pytest.mark.data

@@ -25,26 +25,6 @@ def test_ranges(text: str, wanted: tuple[int, int]) -> None:
     assert frame_range(text, 10) == wanted
 
 
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("5", "is not a range: write A:B"),
-        ("1:2:3", "is not a range"),
-        ("a:b", "is not a range"),
-        ("1.5:3", "is not a range"),
-        ("", "is not a range"),
-        ("0:11", "it has 10 frames; choose within 0:10"),
-        ("10:", "reaches outside"),
-        ("-11:", "reaches outside"),
-        ("4:4", "holds no frames"),
-        ("6:2", "holds no frames"),
-    ],
-)
-def test_bad_ranges(text: str, message: str) -> None:
-    with pytest.raises(SequenceError, match=message):
-        frame_range(text, 10)
-
-
 def test_excerpt_of_an_excerpt(tmp_path: Path, odometry) -> None:
     odometry(tmp_path, frames=10)
     outer = open_sequence(tmp_path, "00", None, "2:9")

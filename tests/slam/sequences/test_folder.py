@@ -56,42 +56,6 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(
         open_sequence(tmp_path, frames="1:4").frame(1)
 
 
-def test_a_gap_under_a_lens(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path, ["0.png", "1.png", "3.png", "4.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n")
-    with pytest.raises(MissingFrameError):
-        open_sequence(tmp_path).frame(2)
-
-
-@pytest.mark.parametrize("fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"])
-def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int) -> None:
-    images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml.replace("fps: 5", f"fps: {fps}"))
-    with pytest.raises(SequenceError, match=rf"no images 5\.png to {last - 1}\.png .*split the recording") as caught:
-        open_sequence(tmp_path)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("step", ["1e8", "1e-9", "nan"])
-def test_stamps_that_cannot_be_seconds_are_refused(tmp_path: Path, images, camera_yaml: str, step: str) -> None:
-    images(tmp_path, [f"{k}.png" for k in range(4)])
-    (tmp_path / "camera.yaml").write_text(camera_yaml)
-    (tmp_path / "times.txt").write_text("".join(f"{k * float(step):.12f}\n" for k in range(4)))
-    with pytest.raises(SequenceError, match=r"s apart: check its stamps|must be numbers that increase"):
-        open_sequence(tmp_path)
-
-
-def test_unlikely_stamps_and_pauses_are_warned_of(
-    tmp_path: Path, images, camera_yaml: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    images(tmp_path, [f"{k}.png" for k in range(4)])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "camera_height_m: 100\n")
-    (tmp_path / "times.txt").write_text("0\n100\n200\n9000\n")
-    open_sequence(tmp_path)
-    assert "its frames are 100 s apart" in caplog.text and "pause for 8800 s before frame 3" in caplog.text
-    assert "camera_height_m is 100" in caplog.text
-
-
 def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path, ["0.png", "1.png", "2.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
@@ -99,17 +63,3 @@ def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images,
     with pytest.raises(SequenceError, match=r"1\.png cannot be decoded") as caught:
         open_sequence(tmp_path).frame(1)
     assert not isinstance(caught.value, MissingFrameError)
-
-
-def test_errors(tmp_path: Path, images, camera_yaml: str) -> None:
-    folder = tmp_path / "drive"
-    images(folder / "images", ["0.png", "1.png", "2.png"])
-    (folder / "camera.yaml").write_text(camera_yaml.replace("width: 40", "width: 44"))
-    with pytest.raises(SequenceError, match="are 40x24, but the camera file is for 44x24"):
-        open_sequence(folder, None, None, None)
-    (folder / "camera.yaml").unlink()
-    with pytest.raises(SequenceError, match=r"no camera\.yaml for images in .*images"):
-        open_sequence(folder, None, None, None)
-    images(folder / "data", ["0.png"])
-    with pytest.raises(SequenceError, match="has images in images, data"):
-        open_sequence(folder, None, None, None)

@@ -40,20 +40,3 @@ def test_the_first_readable_image_gives_the_size(tmp_path: Path, images) -> None
         files.read(0)
     with pytest.raises(SequenceError, match=r"2\.png is 41x24, but 1\.png is 40x24"):
         files.read(2)
-
-
-def test_the_first_image_may_be_of_another_size(tmp_path: Path, images) -> None:
-    """A thumbnail, or a picture taken before the drive."""
-    images(tmp_path, ["0.png"], width=41)
-    images(tmp_path, ["1.png", "2.png"])
-    files = ImageFiles(by_name(list_images(tmp_path)))
-    assert (files.width, files.height) == (40, 24)
-    with pytest.raises(SequenceError, match=r"0\.png is 41x24, but 1\.png is 40x24"):
-        files.read(0)
-
-
-def test_one_image_must_be_readable(tmp_path: Path) -> None:
-    for name in ("0.png", "1.png"):
-        (tmp_path / name).write_bytes(b"")
-    with pytest.raises(DataError, match=r"0\.png is empty"):
-        ImageFiles(by_name(list_images(tmp_path)))

@@ -12,7 +12,7 @@ from slam.commands.doctor import examine
 from slam.config.sections import load_config
 from slam.frames import Frame, Intrinsics
 from slam.prediction.assembly import open_depth
-from slam.runtime.errors import ConfigError, MissingFrameError, SlamError
+from slam.runtime.errors import ConfigError, MissingFrameError
 from slam.runtime.imports import plug_ins
 from slam.sequences.catalogue import open_sequence
 
@@ -69,11 +69,3 @@ def test_the_example_is_a_source_of_depth(install: Callable[[Path], str]) -> Non
     assert source is not None and len(source.sha256) == 64
     disparity = source.disparity(Frame(0, 0.0, np.zeros((24, 40, 3), np.uint8)))
     np.testing.assert_allclose(disparity, np.full((24, 40), 0.4), rtol=1e-6)
-
-
-def test_a_package_that_is_damaged_is_named(tmp_path: Path, install: Callable[[Path], str]) -> None:
-    install(DOCS / "design" / "loaders.md")
-    (tmp_path / "site" / "drives.py").write_text("import nothing_of_this_name")
-    (tmp_path / "drive").mkdir()
-    with pytest.raises(SlamError, match=r"drives of drives cannot be loaded \(No module .*: repair or uninstall it"):
-        open_sequence(tmp_path / "drive")

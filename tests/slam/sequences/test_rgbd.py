@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.runtime.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import MissingFrameError
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.recording import RecordedSequence
 
@@ -76,22 +76,3 @@ def test_scannet(scene: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert open_sequence(scene, camera=Path("fov=90")).intrinsics.fx == pytest.approx(20)
     part = open_sequence(scene, camera=Path("fov=90"), frames="2:4").reference
     assert part is not None and part[1, :3, 3] == pytest.approx([-10, 0, 0])
-
-
-@pytest.mark.parametrize(
-    "name, text, message",
-    [
-        ("pose/40.txt", "1 2 3", "must hold the 4 x 4 numbers of a pose"),
-        ("pose/40.txt", "2 " * 16, "holds no pose: its 3 x 3 part is not a rotation"),
-        ("intrinsic/intrinsic_color.txt", "f 0 0", "must hold the 4 x 4 numbers of a camera"),
-        ("intrinsic/intrinsic_color.txt", "0 " * 16, "fx: input should be greater than 0"),
-        ("color/x.jpg", None, r"x\.jpg is not named by its number"),
-    ],
-)
-def test_damage(scene: Path, name: str, text: str | None, message: str) -> None:
-    if text is None:
-        (scene / "color/20.jpg").rename(scene / name)
-    else:
-        (scene / name).write_text(text)
-    with pytest.raises(SequenceError, match=message):
-        open_sequence(scene)

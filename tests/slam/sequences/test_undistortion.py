@@ -107,12 +107,6 @@ class Blank:
         return np.zeros((self.height, self.width, 3), np.uint8)
 
 
-def test_other_size_suggests_scaled_values() -> None:
-    camera = CameraFile(width=40, height=24, fx=30, fy=30, cx=19.5, cy=11.5, fps=5)
-    with pytest.raises(SequenceError, match=r"are 80x48, .* for 40x24: .*width: 80, height: 48, fx: 60, .*cx: 39.5"):
-        calibrated(Blank(80, 48), camera, "here")
-
-
 def test_pinhole_images_pass_untouched() -> None:
     camera = CameraFile(width=40, height=24, fx=30, fy=30, cx=19.5, cy=11.5, fps=5)
     blank = Blank(40, 24)

@@ -1,4 +1,3 @@
-import shutil
 import struct
 from fractions import Fraction
 from functools import partial
@@ -8,13 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.common.readers import video as reader
 from erfsfm.common.readers.video import VideoFrames
-from erfsfm.data.discovery import discover
-from slam.runtime.errors import SequenceError
 from slam.sequences import video
-from slam.sequences.catalogue import open_sequence, sequence_names
-from slam.sequences.continued import missing_between
+from slam.sequences.catalogue import open_sequence
 
 
 def write_video(path: Path) -> Path:
@@ -42,44 +37,6 @@ def test_opens(tmp_path: Path, camera_64: str, by_folder: bool) -> None:
     assert [bool(sequence.frame(k).image.mean() > 200) for k in range(1, 4)] == [False, True, False]
     assert sequence.stamps[0] == pytest.approx(2.0)
     assert sequence.provenance() == ("folder/trip[10:20]",)
-
-
-def test_the_next_clip_of_a_folder_follows(tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture) -> None:
-    """As dash cams write them."""
-    for name in ("clip1", "clip2"):
-        write_video(tmp_path / "trip" / f"{name}.avi")
-    (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
-    first, following = (open_sequence(tmp_path / "trip", name, frames="0:20") for name in ("clip1", "clip2"))
-    assert first.provenance() == ("folder/trip/clip1[0:20]",)
-    assert missing_between(first.provenance(), following.provenance()) == 0
-    assert "folder/trip/clip2[0:20] is assumed to follow folder/trip/clip1[0:20]" in caplog.text
-
-
-def test_videos_that_differ_in_their_suffix_alone(tmp_path: Path, camera_64: str) -> None:
-    write_video(tmp_path / "trip" / "clip.avi")
-    shutil.copy(tmp_path / "trip/clip.avi", tmp_path / "trip/clip.mkv")
-    write_video(tmp_path / "trip" / "other.avi")
-    (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
-    assert sequence_names(tmp_path / "trip") == ["clip.avi", "clip.mkv", "other"]
-    sequence = open_sequence(tmp_path / "trip", "clip.mkv", frames="0:20")
-    assert (sequence.name, sequence.provenance()) == ("clip.mkv", ("folder/trip/clip.mkv[0:20]",))
-    assert len({recording.name for recording in discover(tmp_path / "trip")}) == 3
-
-
-def test_errors(tmp_path: Path, camera_64: str, camera_yaml: str) -> None:
-    path = write_video(tmp_path / "drive.avi")
-    with pytest.raises(SequenceError, match=r"no camera\.yaml for video .*drive\.avi"):
-        open_sequence(path, None, None, None)
-    (tmp_path / "camera.yaml").write_text(camera_yaml)
-    with pytest.raises(SequenceError, match="are 64x48, but the camera file is for 40x24"):
-        open_sequence(path, None, None, None)
-    (tmp_path / "camera.yaml").write_text(camera_64)
-    write_video(tmp_path / "other.avi")
-    with pytest.raises(SequenceError, match="has 2 sequences: drive, other"):
-        open_sequence(tmp_path, None, None, None)
-    path.write_bytes(b"not a video")
-    with pytest.raises(SequenceError, match=r"drive\.avi cannot be opened"):
-        open_sequence(path, None, None, None)
 
 
 def write_mp4(path: Path, times: list[int], rate: int = 30, rotated: bool = False) -> Path:
@@ -167,20 +124,6 @@ def test_frames_before_the_cut_of_a_trimmed_video_are_not_counted(tmp_path: Path
         assert frames.times_s() == pytest.approx(np.arange(9) / 30, abs=1e-4)
 
 
-def test_a_long_video_without_pyav_is_taken_as_even(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = write_mp4(tmp_path / "long.mp4", [24 * k for k in range(8)], rate=25)
-
-    def absent(name: str) -> None:
-        raise ImportError(f"No module named {name}")
-
-    monkeypatch.setattr(reader.importlib, "import_module", absent)
-    monkeypatch.setattr(video, "VideoFrames", partial(VideoFrames, counted_frames=4))
-    assert open_sequence(path, camera=Path("fov=70")).stamps == pytest.approx(np.arange(8) / 25)
-    assert "erfsfm-slam[video]'); its frames are taken as even" in caplog.text
-
-
 def test_a_rotation_flag_turns_the_images(tmp_path: Path) -> None:
     """A phone held upright stores lying images and a flag: 90 degrees, so that left becomes top."""
     path = write_mp4(tmp_path / "upright.mp4", [20 * k for k in range(4)], rotated=True)
@@ -188,12 +131,3 @@ def test_a_rotation_flag_turns_the_images(tmp_path: Path) -> None:
     assert (sequence.intrinsics.width, sequence.intrinsics.height) == (48, 64)
     image = sequence.frame(2).image
     assert image[:28].mean() > 200 and image[36:].mean() < 130
-
-
-def test_a_camera_of_the_lying_images_is_named(tmp_path: Path, camera_64: str) -> None:
-    path = write_mp4(tmp_path / "upright.mp4", [20 * k for k in range(4)], rotated=True)
-    (tmp_path / "camera.yaml").write_text(camera_64)
-    with pytest.raises(
-        SequenceError, match="are 48x64, but the camera file is for 64x48: they are turned by a quarter"
-    ):
-        open_sequence(path)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import re
 from pathlib import Path
 
 import pytest
@@ -67,20 +65,3 @@ def test_errors_are_one_line_and_name_the_key(tmp_path: Path, camera_yaml: str, 
         read_camera_file(path)
     assert message in str(caught.value)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "warning"),
-    [
-        ("cx: 20", "cx: 31", r"the principal point \(31, 12\) is far from the middle of 40x24 images; check that"),
-        ("fx: 30", "fx: 36", "fx : fy is 1.20, so pixels are not square; check that"),
-        ("fx: 30", "fx: 32", ""),
-    ],
-)
-def test_unlikely_cameras_are_logged_once(
-    tmp_path: Path, camera_yaml: str, caplog: pytest.LogCaptureFixture, old: str, new: str, warning: str
-) -> None:
-    with caplog.at_level(logging.WARNING):
-        read_camera_file(written(tmp_path, camera_yaml.replace(old, new)))
-    assert len(caplog.records) == (1 if warning else 0)
-    assert re.search(warning, caplog.text)

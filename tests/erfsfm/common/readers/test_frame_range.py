@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from erfsfm.common.errors import ConfigError
 from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange, merge, overlapping
 from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES
 
@@ -24,32 +23,6 @@ def test_the_range_is_read_from_the_right(name: str, recording: str, start: int,
     span = FrameRange.parse(name)
     assert span == FrameRange(recording, start, stop)
     assert FrameRange.parse(str(span)) == span
-
-
-def test_a_whole_recording_with_a_range_for_a_name_keeps_its_name() -> None:
-    whole = FrameRange("folder/cut[0:5]", 0, EVERYTHING)
-    assert FrameRange.parse(str(whole)) == whole
-
-
-def test_leaks_of_bracketed_names() -> None:
-    assert overlapping(["folder/br[ack]ets[0:10]"], ["folder/br[ack]ets[5:20]"]) == ["folder/br[ack]ets[0:10]"]
-    assert overlapping(["folder/br[ack]ets[0:5]"], ["folder/br[ack]ets[5:20]"]) == []
-    record = merge(["folder/br[ack]ets[0:10]", "folder/br[ack]ets"])
-    assert merge(record) == record
-
-
-def test_leaks_of_videos_in_one_folder() -> None:
-    clips = ["folder/trip/clip1[0:30]", "folder/trip/clip2[0:30]"]
-    assert overlapping(clips, ["folder/trip/clip1[20:40]"]) == clips[:1]
-    assert overlapping(clips, ["folder/trip[20:40]"]) == clips, "of a record that knew the folder alone"
-    assert overlapping(["folder/trip[20:40]"], clips[:1]) == ["folder/trip[20:40]"]
-    assert overlapping(clips, ["folder/trip[30:40]", "folder/tri[0:9]"]) == []
-
-
-@pytest.mark.parametrize("name", ["kitti_odometry/00[a:b]", "kitti_raw/x[1]", "00[nope]"])
-def test_names_of_data_sets_have_no_brackets(name: str) -> None:
-    with pytest.raises(ConfigError, match="names no frames"):
-        FrameRange.parse(name)
 
 
 @pytest.mark.parametrize(
@@ -90,19 +63,6 @@ def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
     name = f"kitti_odometry/{sequence}"
     assert cut.counted_in(name) == whole.counted_in(name) == FrameRange(name, 0, past_last - first)
     assert FrameRange.parse(name).counted_in(cut.recording) == cut
-
-
-def test_frames_of_the_table() -> None:
-    """The lengths of the benchmark."""
-    lengths = [stop - start for _, start, stop in ODOMETRY_DRIVES.values()]
-    assert lengths == [4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201]
-
-
-@pytest.mark.parametrize("name", ["kitti_odometry/00[", "kitti_odometry/00[a:b]", "x[1]", "", "x[1:2]y"])
-def test_bad_brackets(name: str) -> None:
-    with pytest.raises(ConfigError, match="names no frames") as caught:
-        FrameRange.parse(name)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from erfsfm.common.errors import DataError
 from erfsfm.common.readers.kitti_calibration import CalibrationFile
 from slam.geometry import se3
 from slam.geometry.se3 import invert
@@ -42,20 +41,3 @@ def test_rotation_of_the_rig_translates_the_side_camera() -> None:
     turn_right = se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.zeros(3))
     T_world_camera = np.stack([np.eye(4), turn_right]) @ invert(T_camera_cam0)
     assert T_world_camera[:, :3, 3] == pytest.approx(np.array([[-0.5, 0, 0], [0, 0, 0.5]]), abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("P0: 1 2 3", "row P2|no row P2 in .*found P0"),
-        ("P2: 1 2 3", "row P2 has 3 numbers: it needs 12"),
-        ("P2: 1 2 x 4 5 6 7 8 9 10 11 12", "row P2: could not convert string to float: 'x'"),
-        ("P2: nan 0 20 0 0 30 12 0 0 0 1 0", "needs 12 finite ones"),
-        ("P2: -30 0 20 0 0 30 12 0 0 0 1 0", "no K \\[I \\| t\\] with positive focal lengths"),
-        ("P2: 30 0 41 0 0 30 12 0 0 0 1 0", "principal point at \\(41, 12\\), outside the 40x24 images"),
-        ("", "found nothing"),
-    ],
-)
-def test_malformed(calibration, text: str, message: str) -> None:
-    with pytest.raises(DataError, match=message):
-        calibration(text).pinhole("P2", 40, 24)

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from erfsfm.common.errors import DataError
-from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_number
+from erfsfm.common.readers.numbering import by_number
 
 
 def named(*stems: str) -> list[Path]:
@@ -33,37 +32,3 @@ def test_rows_of_accompanying_files(values: int, rows: list[int] | None, skipped
     assert (None if assigned is None else (assigned[0].tolist(), assigned[1])) == (
         None if rows is None else (rows, skipped)
     )
-
-
-@pytest.mark.parametrize(
-    ("stems", "message"),
-    [
-        (("000000", "extra"), r"extra\.png is not named by its number \(000000\.png\): rename it"),
-        (("0001", "001"), "0001.png and 001.png have the same number"),
-    ],
-)
-def test_names_without_numbers(stems: tuple[str, ...], message: str) -> None:
-    with pytest.raises(DataError, match=message):
-        by_number(named(*stems))
-
-
-@pytest.mark.parametrize(
-    "stems",
-    [
-        ["a", "b", "d"],
-        ["0", "5", "10", "15"],
-        ["frame_07", "frame_08", "frame_09"],
-        ["left_1", "right_2", "right_3", "right_5"],
-        ["1305031102.175304", "1305031102.211214", "1305031102.243211"],
-        ["only"],
-    ],
-)
-def test_folders_without_gaps(stems: list[str]) -> None:
-    files = by_name(named(*stems))
-    assert (len(files), files.first, files.gaps()) == (len(stems), 0, [])
-
-
-def test_a_huge_gap_takes_no_memory() -> None:
-    files = by_name(named("0", "1", "2", "999999999999"))
-    assert len(files) == 10**12 and files.parts() == [(0, 3), (3, 4)]
-    assert isinstance(files, NumberedFiles)

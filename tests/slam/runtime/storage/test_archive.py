@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from slam.loops.places import Places
 from slam.pipeline.checkpoint import read_keyframes, write_keyframes
 from slam.pipeline.observer import Keyframe
 from slam.runtime.errors import RunError
-from slam.runtime.storage.archive import reading_archive
 from slam.runtime.storage.spill import SpillFile
 
 
@@ -51,17 +49,3 @@ def test_no_damage_escapes_as_another_error(tmp_path: Path, name: str) -> None:
                 refused += 1
                 assert name in str(error) and "\n" not in str(error)
     assert refused > len(whole) / 7
-
-
-@pytest.mark.parametrize(
-    "failure",
-    [zlib.error("Error -3"), NotImplementedError("compression"), KeyError("a"), OSError(5, "IO")],
-)
-def test_every_failure_is_one_line_about_the_file(tmp_path: Path, failure: Exception) -> None:
-    with pytest.raises(RunError, match=r"x\.npz is damaged \(\w+"), reading_archive(tmp_path / "x.npz"):
-        raise failure
-
-
-def test_missing_memory_is_not_called_damage(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"x\.npz needs more memory than there is"), reading_archive(tmp_path / "x.npz"):
-        raise MemoryError

@@ -43,21 +43,3 @@ def test_after_any_failure_the_old_file_stays_and_no_partial_file(tmp_path: Path
         write_atomically(path, fill)
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["run.log"]
-
-
-def test_the_error_is_of_the_given_kind_and_names_file_and_cause(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match=r"file/x\.txt: cannot be written \(.+\)"):
-        write_atomically(tmp_path / "file" / "x.txt", lambda partial: partial.write_text("x"), RunError)
-
-
-def test_content_that_the_disk_loses_after_the_writer_gets_no_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", fail)
-    with pytest.raises(SlamError, match=r"map\.ply: cannot be written \(No space left on device\)"):
-        write_atomically(tmp_path / "map.ply", lambda partial: partial.write_text("x"))
-    assert list(tmp_path.iterdir()) == []

@@ -276,28 +276,6 @@ def test_evaluate_depth(run: Run, tmp_path: Path, weights: Path, write_root: Cal
     assert all(row[: head.index("abs_rel") + len("abs_rel")].split()[-1].replace(".", "").isdigit() for row in rows)
 
 
-def test_evaluate_depth_of_streets_fits_a_terminal_and_is_written(
-    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
-) -> None:
-    roots = [write_root(tmp_path / str(seed), frames=6, depth=True, seed=seed) for seed in (600, 601)]
-    datasets = [word for root in roots for word in ("--dataset", root)]
-    command = ("evaluate", "depth", "--weights", weights, *datasets, "--output", tmp_path / "depth.json")
-    code, out, _ = run(*command)
-    assert code == 0
-    lines = out.splitlines()
-    assert [line.split("  ")[0] for line in lines[1:]] == [
-        "networks",
-        "median depth map",
-        "simulated/600",
-        "simulated/601",
-    ]
-    assert max(map(len, lines)) <= 80
-    code, out, _ = run(*command, "--json")
-    assert json.loads(out) == json.loads((tmp_path / "depth.json").read_text())
-    code, _, err = run(*command, "--split", "eigen")
-    assert code == 1 and "take one --dataset; got 2" in err
-
-
 def test_evaluate_refuses_a_leak(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
     root = write_root(tmp_path / "root", frames=6, depth=True, seed=17)
     for verb in (("depth",), ("pose", "--sequence", "00")):

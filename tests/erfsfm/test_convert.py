@@ -200,12 +200,6 @@ def test_pose(
                 torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_old_files_and_parallel_training(tmp_path: Path, pose_file: Path, legacy: bool) -> None:
-    path = save(OldDisp(), tmp_path / "disp.pth.tar", legacy=legacy, prefix="module.")
-    assert [old.kind for old in convert([path, pose_file], tmp_path / "new")] == ["depth", "pose"]
-
-
 def test_the_record(tmp_path: Path, depth_file: Path, pose_file: Path) -> None:
     convert([pose_file, depth_file], tmp_path / "new", size=(94, 310), trained_on=["kitti_odometry/00"], command="me")
     record = load_model(tmp_path / "new").record

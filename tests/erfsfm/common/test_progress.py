@@ -29,11 +29,6 @@ def test_lines_say_what_is_done_how_fast_and_the_time_left() -> None:
     assert lines[-1].startswith("loops: 0 of 1 after "), "said while one item takes long"
 
 
-def test_what_follows_the_comma_of_a_stage_does_not_begin_another() -> None:
-    lines = lines_of([("steps, loss 3", 1, 9), ("steps, loss 2", 2, 9)], 0.2)
-    assert lines[-1].startswith("steps, loss 2: 2 of 9, ") and lines[-1].endswith("s left")
-
-
 def test_short_work_is_quiet_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_bar() as progress:
         progress("frames", 1, 2)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from threading import Thread
 
 import pytest
 
@@ -33,16 +32,3 @@ def test_a_signal_that_is_ignored_or_handled_stays_so() -> None:
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_other_threads_change_nothing() -> None:
-    seen: list[object] = []
-
-    def look() -> None:
-        with raising_on_termination():
-            seen.append(signal.getsignal(signal.SIGTERM))
-
-    thread = Thread(target=look)
-    thread.start()
-    thread.join()
-    assert seen == [signal.SIG_DFL]

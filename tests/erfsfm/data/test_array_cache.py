@@ -67,14 +67,6 @@ def test_drops_the_least_recently_used_frame() -> None:
     assert recording.decoded == [0, 1, 2, 1]
 
 
-def test_recordings_are_kept_apart() -> None:
-    first, second = Painted(), Painted()
-    cache = ImageCache(10, HEIGHT, WIDTH)
-    read(cache, first, 3)
-    read(cache, second, 3)
-    assert first.decoded == second.decoded == [3]
-
-
 def test_a_returned_image_is_unchanged_when_its_block_is_reused() -> None:
     recording = Painted()
     cache = ImageCache(1, HEIGHT, WIDTH)

@@ -60,23 +60,6 @@ def test_kitti_root(tmp_path: Path, write_root: Callable[..., Path], prefix: str
     assert isinstance(camera.fx, float)
 
 
-@pytest.mark.parametrize(
-    ("folders", "expected"),
-    [
-        (("image_0", "image_1", "image_2", "image_3"), ["image_2", "image_3"]),
-        (("image_0", "image_3"), ["image_3"]),
-        (("image_0", "image_1"), ["image_0"]),
-        (("image_1",), ["image_1"]),
-    ],
-)
-def test_colour_before_grey(
-    tmp_path: Path, write_root: Callable[..., Path], folders: tuple[str, ...], expected: list[str]
-) -> None:
-    write_root(tmp_path, frames=2, cameras=folders)
-    assert [r.images[0].parent.name for r in discover(tmp_path)] == expected
-    assert {r.name for r in discover(tmp_path)} == {"kitti_odometry/00"}
-
-
 def test_simulated_root_is_named_by_its_seed(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=3, seed=17, depth=True)
     recording = one(tmp_path)
@@ -116,12 +99,6 @@ def test_poses_are_those_of_the_camera_that_took_the_images(tmp_path: Path, writ
     assert paper is not None
     np.testing.assert_allclose(poses[:, :3, 3], [[-0.5, 0, 0], [3, 0, -0.5]], atol=1e-12)
     np.testing.assert_allclose(paper[:, :3, 3], [[0, 0, 0], [3, 0, 0]])
-
-
-def test_depth_of_other_frames_is_left_out(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    write_root(tmp_path, frames=3, depth=True)
-    (tmp_path / "sequences/00/depth_2/000001.png").unlink()
-    assert one(tmp_path).depth is None
 
 
 @pytest.mark.parametrize("inside", ["", "images"])
@@ -185,25 +162,3 @@ def test_a_recording_is_split_at_its_gaps(
         assert recording.images[0].stem == f"{recording.start:06d}"
     assert second.within(0, 6) == second.part(0, 1)
     assert second.within(0, 5) is None and second.within(9, 12) is None
-
-
-def test_poses_of_the_images_that_exist(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    write_root(tmp_path, frames=6, step=(0.0, 0.0, 0.5))
-    (tmp_path / "sequences/00/image_2/000002.png").unlink()
-    poses = tmp_path / "poses/00.txt"
-    rows = poses.read_text().splitlines()
-    poses.write_text("\n".join(rows[:2] + rows[3:]) + "\n")
-    T_world_camera = discover(tmp_path)[1].true_poses()
-    assert T_world_camera is not None
-    np.testing.assert_allclose(T_world_camera[:, 2, 3], [1.5, 2.0, 2.5])
-
-
-def test_a_folder_is_split_at_its_gaps(tmp_path: Path) -> None:
-    write_images(write_camera(tmp_path / "drive"), count=7)
-    (tmp_path / "drive/0004.png").unlink()
-    assert [r.frames_name for r in discover(tmp_path / "drive")] == ["folder/drive[0:4]", "folder/drive[5:7]"]
-
-
-def test_undistorted_opencv_camera_is_a_pinhole(tmp_path: Path) -> None:
-    write_images(write_camera(tmp_path, model="opencv", distortion=[0, 0, 0, 0]))
-    assert one(tmp_path).camera.fx == 40

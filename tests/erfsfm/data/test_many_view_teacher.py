@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from erfsfm.common.errors import TrainingError
-from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import SnippetDraws
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
@@ -117,33 +115,6 @@ def test_learned_depth_is_refined_around_a_frame_at_the_size_of_the_labels(recor
     assert both.mean() > 0.3
     ratio = np.sqrt(least[both] * most[both]) * true[both] / 1.65
     assert abs(np.median(ratio) - 1) < 0.1 and np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.06
-
-
-def test_only_labelled_frames_are_drawn(recording, teacher):
-    tree = {
-        "network": {"height": SIZE[0], "width": SIZE[1]},
-        "data": {"flip": 1.0, "zoom": 1.0},
-        "teacher": {"views": "many", "structure_weight": 1.0},
-    }
-    draws = SnippetDraws([recording], ExperimentConfig.model_validate(tree), 4, many_views=teacher)
-    camera = recording.camera.resized(SIZE[1], SIZE[0])
-    true = np.linalg.norm(np.diff(recording.true_poses()[:, :3, 3], axis=0), axis=1).mean()
-    for number in range(4):
-        sample = draws.draw(number)
-        assert sample["least"].shape == (1, *SIZE) and np.isfinite(sample["T_source_target"]).all()
-        steps = np.linalg.norm(sample["T_source_target"][:, :3, 3], axis=1) * 1.65
-        nearer = camera.fy / SIZE[0] / 1.9  # lengths are those of KITTI's focal length
-        assert steps[1] * nearer == pytest.approx(true, rel=0.25)
-
-
-def test_poses_alone_need_no_label(recording, teacher, tmp_path):
-    alone = ManyViewTeacher(tmp_path, SIZE, stride=6, measures="poses")
-    alone.drive(recording).keep_poses(teacher.drive(recording).T_world_camera)
-    alone.prepare([recording], 4, "sim", lambda *progress: pytest.fail(f"measured {progress}"))
-    assert list(alone.drive(recording).targets(4)) == list(range(2, 26))
-    seen = alone.structure(recording, first=9, sources=4)
-    np.testing.assert_array_equal(seen.T_source_target, teacher.drive(recording).motion(9, 4))
-    assert not seen.least.any() and np.isinf(seen.most).all()
 
 
 def test_poses_by_other_weights_are_refused(recording, teacher):

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
@@ -113,18 +112,6 @@ def test_windows_are_consecutive_frames_with_the_target_in_the_middle(coded: Pat
         assert sample["K"].dtype == torch.float32
         starts.add((folder_of(sample), frames[0]))
     assert len(starts) == 2 * (FRAMES - sources), "every window of both recordings comes up"
-
-
-def test_a_draw_depends_on_seed_and_number_alone(coded: Path) -> None:
-    draws = SnippetDraws(discover(coded), experiment(), 20)
-    forwards = [draws.draw(number) for number in range(20)]
-    fresh = SnippetDraws(discover(coded), experiment(cache_mb=0), 20)
-    backwards = [fresh.draw(number) for number in reversed(range(20))][::-1]
-    assert all(equal(a, b) for a, b in zip(forwards, backwards))
-    config = experiment()
-    reseeded = config.model_copy(update={"training": config.training.model_copy(update={"seed": 1})})
-    other = SnippetDraws(discover(coded), reseeded, 20)
-    assert not all(equal(a, other.draw(number)) for number, a in enumerate(forwards))
 
 
 def batches(coded: Path, workers: int, first: int = 0, draws: int = 10) -> list[dict[str, Tensor]]:
@@ -244,23 +231,6 @@ def test_validation_recordings_only_validate(tmp_path: Path, write_root: Callabl
     assert validation == ["simulated/500[0:2]", "simulated/599[0:2]"]
 
 
-@pytest.mark.parametrize(
-    ("ranges", "held_out", "left"),
-    [
-        ({"kitti_odometry/00": "0:4"}, "kitti_odometry/00[4:]", ["0:4"]),
-        ({}, "kitti_odometry/00[2:4]", ["0:2", "4:6"]),
-        ({}, "kitti_raw/2011_10_03_drive_0027_sync[:2]", ["2:6"]),
-        ({"kitti_odometry/00": "1:5"}, "kitti_odometry/00[3:4]", ["1:3", "4:5"]),
-    ],
-)
-def test_validation_of_held_back_frames(kitti: Path, ranges: dict[str, str], held_out: str, left: list[str]) -> None:
-    """The frames around them train."""
-    training, validation = names(DataConfig(roots=[kitti], ranges=ranges, validation=[held_out, "kitti_odometry/09"]))
-    assert training == [f"kitti_odometry/00[{span}]" for span in left]
-    assert len(validation) == 2 and validation[1] == "kitti_odometry/09[0:6]"
-    assert not overlapping(training, validation)
-
-
 @pytest.fixture
 def raw(tmp_path: Path, write_raw: Callable[..., Path]) -> Path:
     """A drive to train on, one of Eigen's scenes, and the drives of the odometry sequences 00 (a scene too) and 09."""
@@ -297,14 +267,6 @@ def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]) -> 
     assert validation == ["kitti_odometry/06[0:3]"]
 
 
-def test_eigens_scenes_exclude_their_odometry_sequences_by_split_alone(tmp_path: Path, kitti: Path) -> None:
-    """The paper trains on 00; the split excludes it."""
-    assert names(DataConfig(roots=[kitti]))[0] == ["kitti_odometry/00[0:6]"]
-    (tmp_path / "test.yaml").write_text("test: ['kitti_raw/2011_10_03_drive_0027[0:3]']\n")
-    with pytest.raises(DataError, match="nothing left to train on"):
-        split_recordings(DataConfig(roots=[kitti], split=str(tmp_path / "test.yaml")))
-
-
 def test_a_mirrored_sample_has_mirrored_structure(tmp_path: Path) -> None:
     street = SimulatedStreet(SimulationOptions(frames=250, seed=702))
     camera = {"width": 416, "height": 128, "fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "fps": 10}
@@ -330,22 +292,6 @@ def test_a_mirrored_sample_has_mirrored_structure(tmp_path: Path) -> None:
     torch.testing.assert_close(
         mirrored["T_source_target"][:, 0, 2], -straight["T_source_target"][:, 0, 2]
     )  # the other way round
-
-
-def test_ranges_and_gaps(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    """A range holds for every part of its recording; a part outside it is not trained on."""
-    root = write_root(tmp_path, frames=12, seed=3)
-    for number in (4, 8):
-        (root / f"sequences/00/image_2/{number:06d}.png").unlink()
-
-    def names(**data: object) -> list[str]:
-        training, _ = split_recordings(DataConfig.model_validate({"roots": [root], "validation": [], **data}))
-        return [recording.frames_name for recording in training]
-
-    assert names() == ["simulated/3[0:4]", "simulated/3[5:8]", "simulated/3[9:12]"]
-    assert names(ranges={"simulated/3": "2:7"}) == ["simulated/3[2:4]", "simulated/3[5:7]"]
-    with pytest.raises(DataError, match=r"simulated/3\[12:\] begins after the 12 frames that the recording has"):
-        names(ranges={"simulated/3": "12:"})
 
 
 def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(

@@ -65,14 +65,6 @@ def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(opened) == 2
 
 
-def test_a_file_that_was_replaced_is_decoded_again(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.avi", codec="MJPG")
-    assert number(Video(path).image(11, 32, 48)) == 11
-    path.write_bytes(write(tmp_path / "b.avi", 12, "MJPG").read_bytes())
-    with pytest.raises(IndexError):
-        Video(path).image(12, 32, 48)
-
-
 def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = Video(write(tmp_path / "a.mp4"))
     whole = Recording("folder/a", (video.path,) * len(video), Camera(48, 32, 40.0, 40.0, 23.5, 15.5), video)

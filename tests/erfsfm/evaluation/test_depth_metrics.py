@@ -50,10 +50,6 @@ def test_valid_pixels() -> None:
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (153, 370, 44, 1196)
 
 
-def test_no_truth() -> None:
-    assert depth_errors(np.ones((2, 2), np.float32), np.zeros((2, 2), np.float32)) is None
-
-
 def test_every_image_counts_once() -> None:
     truth = np.full((1, 4), 10, np.float32)
     first = depth_errors(truth, truth, scaling="none")

@@ -82,24 +82,6 @@ def test_frames_of_a_sequence_are_checked_for_leaks(tmp_path: Path, write_root: 
         pose_protocol(seen, tmp_path, ["00[11:]"], "default", allow_leak=False)
 
 
-def test_snippets_on_both_sides_of_gaps_are_of_one_sequence(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    root = write_root(tmp_path, frames=20, step=STEP)
-    for missing in (9, 17):  # parts of 9, 7 and 2 frames
-        (root / f"sequences/00/image_2/{missing:06d}.png").unlink()
-    for name, shown, count in (("00", "kitti_odometry/00", 8), ("00[3:]", "kitti_odometry/00[3:20]", 5)):
-        networks, straight = pose_protocol(Oracle(STEP), root, [name], "default", allow_leak=False)
-        assert networks["snippets"] == straight["snippets"] == count
-        assert networks["recording"] == shown
-        assert networks["ate_mean"] == pytest.approx(0, abs=1e-9)
-
-
-def test_sequences_of_a_simulated_root_go_by_their_folder(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    write_root(tmp_path, frames=5, seed=600, step=STEP)
-    for name in ("00", "simulated/600"):
-        networks, _ = pose_protocol(Oracle(STEP), tmp_path, [name], "default", allow_leak=False)
-        assert networks["recording"] == "simulated/600"
-
-
 def test_paper_fidelity_counts_four_empty_snippets(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=9, step=STEP)
     default = pose_protocol(Oracle(STEP), tmp_path, ["00"], "default", allow_leak=False)[1]

@@ -10,20 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.common.errors import DataError
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, lidar_depth
 
 DRIVE = "2011_09_26_drive_0099"
 PointsAt = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float32]]
 Write = Callable[..., Path]
-
-
-def test_windows_shift_at_the_ends(tmp_path: Path, write_drive: Write) -> None:
-    write_drive(tmp_path, frames=9)
-    windows = {i: RawFrame(tmp_path, DRIVE, i).window(4) for i in (0, 2, 4, 8)}
-    assert windows == {0: [0, 1, 2, 3, 4], 2: [0, 1, 2, 3, 4], 4: [2, 3, 4, 5, 6], 8: [4, 5, 6, 7, 8]}
-    with pytest.raises(DataError, match="9 images; its poses need windows of 11"):
-        RawFrame(tmp_path, DRIVE, 0).window(10)
 
 
 @pytest.mark.parametrize("fidelity", ["default", "paper"])
@@ -50,15 +41,6 @@ def test_the_papers_numbering_confuses_the_ends_of_rows(
     default, paper = (lidar_depth(frame, (64, 96), fidelity) for fidelity in ("default", "paper"))
     assert (default[9, 95], default[10, 0]) == pytest.approx((40, 15))
     assert (paper[9, 95], paper[10, 0]) == pytest.approx((15, 15))
-
-
-def test_smaller_images_see_the_same_depth(tmp_path: Path, write_drive: Write, points_at: PointsAt) -> None:
-    v, u = np.mgrid[1:65, 1:97]
-    z = 10 + 0.1 * u.ravel()
-    points = points_at(np.stack([u.ravel(), v.ravel()], axis=1).astype(float), z)
-    frame = RawFrame(write_drive(tmp_path, points=points, stored=(32, 48)), DRIVE, 0)
-    half, full = lidar_depth(frame, (32, 48)), lidar_depth(frame, (64, 96))
-    np.testing.assert_allclose(half, full.reshape(32, 2, 48, 2).min(axis=(1, 3)), rtol=1e-6)
 
 
 def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write) -> None:

@@ -57,17 +57,6 @@ def test_points_behind_the_camera_are_invalid() -> None:
     assert not project_into_source(depth, moved(0, 0, -3), camera(11, 11)).valid.any(), "nor those in its plane"
 
 
-def test_every_sample_of_a_batch_has_its_own_camera_and_motion() -> None:
-    depth = torch.rand(2, 1, 9, 12) + 4
-    T = torch.cat([moved(0.3, 0, 0), moved(0, 0.2, -1)])
-    K = torch.cat([camera(12, 9), camera(12, 9, 20.0)])
-    both = project_into_source(depth, T, K)
-    for k in range(2):
-        one = project_into_source(depth[k : k + 1], T[k : k + 1], K[k : k + 1])
-        torch.testing.assert_close(both.grid[k : k + 1], one.grid)
-        assert torch.equal(both.valid[k : k + 1], one.valid)
-
-
 @pytest.mark.parametrize("bad", [float("inf"), float("nan"), 1e30])
 def test_extreme_depth_gives_finite_values(bad: float) -> None:
     image = torch.rand(1, 3, 8, 8)

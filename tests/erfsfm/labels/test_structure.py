@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.labels.road import on_road, road_plane, under_road
 from erfsfm.labels.structure import TeacherStructure, measure_structure
-from erfsfm.labels.two_view import two_view
 from erfsfm.mvs.flow import rays
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
@@ -54,14 +53,6 @@ def test_a_camera_at_rest_has_no_motion_and_no_depth_bounds(street):
     assert not seen.least.any() and np.isinf(seen.most).all()
 
 
-def test_a_blank_wall_gives_no_measurement(street):
-    blank = np.full((128, 416, 3), 127, np.uint8)
-    noise = np.random.default_rng(0).integers(0, 255, (128, 416, 3), dtype=np.uint8)
-    assert two_view(blank[..., 0], noise[..., 0], street.K.astype(np.float32), fine=False) is None
-    seen = measure_structure([noise, blank, noise], street.K.astype(np.float32))
-    assert np.isnan(seen.T_source_target).all() and np.isinf(seen.most).all()
-
-
 def test_height_over_a_known_plane_with_a_car_on_it():
     K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
     p = rays(128, 416, K)
@@ -85,12 +76,6 @@ def test_the_road_is_filled_where_nothing_was_measured_but_not_under_a_car():
     level = on_road(inverse_depth, known, road)
     assert level[120, 200:300].all() and level[95, 200:300].all()
     assert not level[:62].any() and not level[70:88, 80:120].any()
-
-
-def test_no_road_in_a_wall():
-    K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
-    wall = np.full((128, 416), 0.1, np.float32)
-    assert road_plane(wall, wall > 0, rays(128, 416, K), np.array([0.0, 0, 1])) is None
 
 
 def test_a_car_at_the_cameras_speed_gets_no_far_depth():

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from erfsfm.networks.blocks import ConvBlock, Encoder, Layer, UpBlock
+from erfsfm.networks.blocks import ConvBlock, Layer
 from erfsfm.networks.deformable import DeformableConv2d
 
 
@@ -33,16 +33,3 @@ def test_batch_norm_sits_between_convolution_and_relu(deformable):
     plain = ConvBlock(2, 4, Layer(3, 1, deformable=deformable))
     difference = sum(p.numel() for p in block.parameters()) - sum(p.numel() for p in plain.parameters())
     assert difference == 8
-
-
-@pytest.mark.parametrize("kernel", [3, 4])
-def test_up_block_doubles(kernel):
-    assert UpBlock(3, 5, kernel)(torch.zeros(1, 3, 4, 7)).shape == (1, 5, 8, 14)
-
-
-def test_encoder_keeps_every_stage():
-    layers = [Layer(3, 2), Layer(3, 1), Layer(3, 2)]
-    first = [ConvBlock(3, 4, layers[0]), ConvBlock(4, 4, layers[1])]
-    encoder = Encoder([first, [ConvBlock(4, 8, layers[2])]])
-    assert [tuple(output.shape) for output in encoder(torch.zeros(1, 3, 9, 9))] == [(1, 4, 5, 5), (1, 8, 3, 3)]
-    assert encoder.layers() == layers

@@ -80,19 +80,6 @@ def test_cameras_stay_where_they_were_guessed_in_the_targets_frame() -> None:
     torch.testing.assert_close(after, before, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("colour", [-1.0, 0.0, 1.0])
-def test_blank_images_keep_the_guess(colour: float) -> None:
-    image = torch.full((1, 3, HEIGHT, WIDTH), colour)
-    guess = torch.rand(1, 4, 6, generator=torch.Generator().manual_seed(0)) / 50
-    torch.testing.assert_close(aligned(guess, image, [image] * 4), guess, atol=1e-5, rtol=0)
-
-
-def test_a_darker_image_is_no_turn() -> None:
-    target, sources = snippet(TURNS)
-    darker = [source - 0.2 for source in sources]
-    assert errors_deg(aligned(torch.zeros(1, 4, 6), target, darker), TURNS).max() < 0.15
-
-
 def test_a_network_guesses_in_training_and_measures_afterwards() -> None:
     target, sources = snippet(TURNS)
     plain, network = build("posenet", width=0.1), build("posenet", width=0.1, alignment="images")

@@ -12,7 +12,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from erfsfm.checkpoint import build_networks
 from erfsfm.config import ExperimentConfig, LossConfig, TeacherConfig, load_experiment
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
@@ -137,25 +136,6 @@ def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: st
         assert pose_net.vectors.grad is not None
         assert float(depth_net.disparity.grad) * (factor - 1) > 0
         assert float((pose_net.vectors.grad * true_poses()).sum()) * (factor - 1) > 0
-
-
-@pytest.mark.parametrize("masks", [False, True])
-def test_every_weight_of_both_networks_has_a_gradient(masks: bool) -> None:
-    config = ExperimentConfig.model_validate(
-        {
-            "network": {"sources": 2, "masks": masks, "depth_width": 0.0625, "pose_width": 0.125},
-            "loss": {"mask_weight": 0.2 * masks, "ssim_weight": 0.5},
-        }
-    )
-    depth_net, pose_net = build_networks(config.network)
-    K = torch.tensor([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]).expand(2, 3, 3)
-    batch = SnippetBatch(torch.rand(2, 3, 32, 64), torch.rand(2, 2, 3, 32, 64), K)
-    evaluate_objective(depth_net, pose_net, batch, config).total.backward()
-    for net in (depth_net, pose_net):
-        for name, weight in net.named_parameters():
-            assert weight.grad is not None, name
-            assert torch.isfinite(weight.grad).all(), name
-        assert any(float(weight.grad.abs().sum()) > 0 for weight in net.parameters() if weight.grad is not None)
 
 
 def bilinear(image: np.ndarray, x: float, y: float) -> np.ndarray:
@@ -298,16 +278,6 @@ def test_masks_weigh_the_error_and_are_regularised_towards_one(batch: SnippetBat
     assert float(outcome.total) == pytest.approx(plain / 2 + 0.4 * math.log(2))
 
 
-@pytest.mark.parametrize("reduction", ["mean", "minimum"])
-def test_masks_do_not_change_which_pixels_move(batch: SnippetBatch, reduction: str) -> None:
-    wanted = {"reduction": reduction, "auto_mask": True}
-    plain = evaluate(batch, experiment(**wanted), 0.3, true_poses())
-    masks = FixedPose(true_poses(), mask=0.5)
-    with torch.no_grad():
-        halved = evaluate_objective(FixedDepth(0.3), masks, batch, experiment(masks=True, mask_weight=0.1, **wanted))
-    assert float(halved.terms["photometric"]) == pytest.approx(float(plain.terms["photometric"]) / 2)
-
-
 def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> None:
     single = SnippetBatch(batch.target.float(), batch.sources.float(), batch.K.float())
     config = experiment(ssim_weight=0.85)
@@ -370,23 +340,6 @@ def test_many_views_have_one_unit_that_depth_and_motion_must_have(batch: Snippet
     middle, half_width = math.sqrt(0.098 * 0.102), math.log(0.102 / 0.098) / 2
     assert twice.terms["structure"].item() == pytest.approx(math.log(0.2 / middle) - half_width / 2, rel=1e-3)
     assert twice.terms["translation"].item() == pytest.approx(0, abs=1e-3)  # the unit is not the depth's
-
-
-def test_each_network_learns_alone_under_many_views(batch: SnippetBatch) -> None:
-    height, width = batch.target.shape[-2:]
-    half = torch.full((2, 1, height, width), 0.5).double()
-    T_source_target = torch.eye(4).double().expand(2, 2, 4, 4)
-    labelled = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
-
-    class Refused(nn.Module):
-        def forward(self, *_: Any) -> Any:
-            raise AssertionError("this network is not needed")
-
-    pose_net, depth_net = FixedPose(true_poses()), FixedDepth(0.3)
-    for_pose = evaluate_objective(Refused(), pose_net, labelled, _many_views("pose"))
-    assert set(for_pose.terms) >= {"rotation", "translation"} and not for_pose.disparities
-    for_depth = evaluate_objective(depth_net, Refused(), labelled, _many_views("depth"))
-    assert "rotation" not in for_depth.terms and for_depth.terms["structure"].item() > 0
 
 
 def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, plane) -> None:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_model
-from erfsfm.common.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
+from erfsfm.common.errors import BusyError, ConfigError, DataError, TrainingError
 from erfsfm.common.lock import FolderLock
 from erfsfm.common.signals import Terminated
 from erfsfm.config import ExperimentConfig, TrainedNetworks, load_experiment
@@ -205,33 +205,12 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
     torch.testing.assert_close(weights_of(tmp_path / "cut" / "last"), expected)
 
 
-def test_a_finished_run_can_be_extended(alone: Configure, tmp_path: Path) -> None:
-    config = alone()
-    longer = alone(training={"steps": 6})
-    train(longer, tmp_path / "whole", device="cpu")
-    train(config, tmp_path / "run", device="cpu")
-    train(longer, tmp_path / "run", resume=True, device="cpu")
-    assert same(tmp_path / "whole", tmp_path / "run")
-    assert load_experiment(tmp_path / "run" / "config.yaml").training.steps == 6
-
-
 def test_a_folder_that_another_training_writes_to_is_refused(alone: Configure, tmp_path: Path) -> None:
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
         with pytest.raises(BusyError, match="another process writes to"):
             train(alone(), tmp_path / "run", device="cpu")
     assert not list((tmp_path / "run").iterdir())
-
-
-def test_the_best_weights_stay_in_the_output_folder(
-    both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, math.nan])
-    config = both(training={"steps": 4, "validate_every": 1})
-    output = train(config, tmp_path / "run", device="cpu")
-    assert load_model(output).record.step == 2
-    assert load_model(output).record.metrics["abs_rel"] == 0.2
-    assert load_model(output / "last").record.step == 4
 
 
 def scripted_validation(monkeypatch: pytest.MonkeyPatch, name: str, values: list[float]) -> None:
@@ -258,24 +237,6 @@ def saved(config: ExperimentConfig, networks: TrainedNetworks, folder: Path) -> 
     absent = {"depth": (depth_net, Absent("pose", folder)), "pose": (Absent("depth", folder), pose_net)}
     save_model(folder, Model(record, *absent.get(networks, (depth_net, pose_net))))
     return folder
-
-
-def test_a_network_that_was_never_trained_is_neither_measured_nor_written(
-    both: Configure, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    teacher = poses_measured(world, tmp_path)
-    config = both(training={"networks": "pose"}, teacher=teacher)
-    interrupted(monkeypatch, config, tmp_path / "run", 3)
-    output = train(config, tmp_path / "run", resume=True, device="cpu")
-    model = load_model(output)
-    assert model.record.networks == "pose" and not list(output.rglob("depth.safetensors"))
-    assert set(model.record.metrics) == {"snippet_ate", "snippet_re"}
-    with pytest.raises(CheckpointError, match="holds no depth network: the other one alone was trained"):
-        DepthPosePredictor.from_weights(output).depth(np.zeros((32, 64, 3), np.uint8))
-    depth = both(training={"networks": "depth"})
-    joined = train(depth.model_copy(update={"initial_weights": str(output)}), tmp_path / "both", device="cpu")
-    assert load_model(joined).record.networks == "both", "one trained here, the other before"
-    assert {"abs_rel", "photometric", "snippet_ate"} <= load_model(joined).record.metrics.keys()
 
 
 @pytest.mark.parametrize(
@@ -383,13 +344,6 @@ def test_initial_weights_pass_on_their_leak_record_and_the_size_of_single_images
     assert record.licence.startswith("CC BY-NC-SA") and record.depth_input == larger
     for trained, initial in zip(weights_of(second), weights_of(first), strict=True):
         torch.testing.assert_close(trained, initial)
-
-
-def test_initial_weights_without_alignment(alone: Configure, tmp_path: Path) -> None:
-    first = train(alone(training={"steps": 1}), tmp_path / "first", device="cpu")
-    aligned = alone(network={"alignment": "images"}, training={"steps": 1})
-    second = train(aligned.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
-    assert load_model(second).record.network.alignment == "images", "it has no weights: any may begin with it"
 
 
 def test_resume_with_other_data_keeps_the_leak_record(
@@ -516,27 +470,11 @@ def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path) -> None:
         train(config, tmp_path / "run", device="cpu")
 
 
-def test_a_failed_start_leaves_nothing(alone: Configure, tmp_path: Path) -> None:
-    config = alone().model_copy(update={"initial_weights": "nowhere"})
-    with pytest.raises(CheckpointError):
-        train(config, tmp_path / "run", device="cpu")
-    assert not (tmp_path / "run").exists()
-
-
 def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
     config, output = cut
     network = config.network.model_copy(update={"pose": "erf-posenet-dilated"})
     with pytest.raises(ConfigError, match="networks"):
         train(config.model_copy(update={"network": network}), output, resume=True, device="cpu")
-
-
-def test_resume_with_another_learning_rate(cut: tuple[ExperimentConfig, Path]) -> None:
-    config, output = cut
-    training = config.training.model_copy(update={"learning_rate": 1e-12, "steps": 6})
-    state = torch.load(output / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-    train(config.model_copy(update={"training": training}), output, resume=True, device="cpu")
-    for name, value in load_model(output).pose_net.state_dict().items():
-        torch.testing.assert_close(value, state[f"pose_net.{name}"], rtol=0, atol=1e-9)
 
 
 class Malicious:

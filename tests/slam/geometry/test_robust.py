@@ -22,10 +22,6 @@ def test_the_median_is_that_of_numpy(shape: tuple[int, ...], kind: type) -> None
     assert median(values) == np.median(values)
 
 
-def test_nothing_has_no_median() -> None:
-    assert np.isnan(median(np.zeros(0)))
-
-
 def test_a_weighted_median_is_where_half_of_the_weight_lies() -> None:
     values = np.array([3.0, 1.0, 2.0])
     assert weighted_median(values, np.array([1.0, 1.0, 1.0])) == 2.0

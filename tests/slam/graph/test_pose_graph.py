@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
@@ -8,7 +6,6 @@ from slam.config.sections import PoseGraphConfig
 from slam.frames import RelativePose
 from slam.geometry import se3
 from slam.graph.pose_graph import LOOP_SOURCE, PoseGraph, whitened_squared
-from slam.runtime.errors import SlamError
 
 ROTATION, TRANSLATION = 0.003, 0.03
 
@@ -102,19 +99,6 @@ def test_world_stays_at_the_first_pose():
     np.testing.assert_allclose(solved, moved, atol=1e-5)
 
 
-def test_correlated_sigmas_weigh_a_chain_against_a_loop_and_leave_sigmas_as_they_are():
-    """The graph uses ``correlated_sigmas``; the sigmas of single factors stay."""
-    truth, edges, _, loops, initial = noisy_problem()
-    chained = [replace(each, correlated_sigmas=4.0 * each.sigmas) for each in edges]
-    looser = [replace(each, sigmas=4.0 * each.sigmas) for each in edges]
-    solved, solved_looser, stiff = (solve([*each, *loops], initial)[1] for each in (chained, looser, edges))
-    np.testing.assert_array_equal(solved, solved_looser)
-    assert np.abs(solved - stiff).max() > 1e-3
-    np.testing.assert_array_equal(*(whitened_squared(each, truth) for each in (chained, edges)))
-    with pytest.raises(SlamError, match="six positive sigmas"):
-        PoseGraph(PoseGraphConfig()).add_relative(replace(edges[0], correlated_sigmas=np.zeros(6)))
-
-
 def test_whitened_residual_by_hand():
     sigmas = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
     measured = RelativePose(0, 1, np.eye(4), sigmas, "network")
@@ -143,25 +127,6 @@ def test_g2o_round_trip_through_gtsam(tmp_path):
         np.testing.assert_allclose(factor.measured().matrix(), e.T_from_to, atol=1e-12)
         np.testing.assert_allclose(factor.noiseModel().sigmas(), sigmas, rtol=1e-9)
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_newest_loops_are_dropped_when_the_system_is_singular(monkeypatch):
-    _, odometry, _, loops, initial = noisy_problem(count=40)
-    graph = PoseGraph(PoseGraphConfig())
-    graph.add_relative(*odometry, *loops[:3])
-    solve_for_real = graph._solve
-
-    def fails_with_more_than_one_loop(start):
-        if len(graph.relative_poses) > len(odometry) + 1:
-            raise RuntimeError("Indeterminant linear system\nlong explanation")
-        return solve_for_real(start)
-
-    monkeypatch.setattr(graph, "_solve", fails_with_more_than_one_loop)
-    graph.optimise(initial)
-    assert graph.dropped == (loops[2], loops[1])
-    monkeypatch.setattr(graph, "_solve", lambda start: (_ for _ in ()).throw(RuntimeError("singular")))
-    with pytest.raises(SlamError, match=r"singular$"):
-        graph.optimise(initial)
 
 
 def test_a_loop_contradicted_by_the_rest_is_dropped():

@@ -48,9 +48,3 @@ def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:
     far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
     kept, refused = agreeing(far, ring(), THRESHOLDS)
     assert kept == [] and all("corrects the odometry by more than 30% of" in r.reason for r in refused)
-
-
-def test_loops_of_one_image_do_not_support_each_other() -> None:
-    same = [loop(k, 220, ring()) for k in range(12, 30, 2)]
-    kept, refused = agreeing(same, ring(), THRESHOLDS)
-    assert kept == [] and len(refused) == len(same)

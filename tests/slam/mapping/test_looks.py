@@ -85,16 +85,3 @@ def test_how_far_depth_is_fused_depends_on_its_sigma():
     assert 19 < farthest(None) < 20 and 19 < farthest(np.full_like(depth, 0.1)) < 20
     assert 23 < farthest(np.full_like(depth, 0.05)) <= 24  # 0.05 of 24 m is 1.2 m
     assert 29 < farthest(np.full_like(depth, 0.02)) < 30
-
-
-def test_border_sky_and_edges_are_no_doubt_of_exact_depth():
-    camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
-    depth = np.full((50, 100), 10.0, np.float32)
-    depth[:, 60:] = 15.0
-    image = np.full((50, 100, 3), 250, np.uint8)
-    filters = DepthFilters(MappingConfig(border=0.1), camera)
-    exact = filters.kept(KeyframeDepth(0, depth, np.zeros_like(depth), image, np.eye(4)), ())
-    np.testing.assert_array_equal(exact, depth)
-    learned = filters.kept(KeyframeDepth(0, depth, np.full_like(depth, 0.05), image, np.eye(4)), ())
-    assert (learned[24:, 10:59] > 0).all() and (learned[24:, 61:90] > 0).all()
-    assert np.count_nonzero(learned) == 26 * 78  # rows below the horizon

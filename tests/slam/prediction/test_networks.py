@@ -167,12 +167,3 @@ def test_a_broken_entry_is_computed_and_written_again(
         np.testing.assert_array_equal(cached(networks, tmp_path)[0].depth(*again([frame])), expected)
     assert networks.asked == 2 and "damaged" in caplog.text
     assert entries(tmp_path) == [path] and path.read_bytes() == whole
-
-
-def test_a_new_image_in_the_memory_of_an_old_one_is_another_image(tmp_path: Path) -> None:
-    """Digests belong to frames: a new array at the same address must not inherit one."""
-    predictor, _ = cached(Counting(), tmp_path)
-    for seed in range(20):
-        (frame,) = frames(seed, 1)
-        np.testing.assert_array_equal(predictor.depth(frame), 1 / ((frame.image[..., 0].astype(np.float32) + 1) / 7))
-        del frame

@@ -36,17 +36,6 @@ def test_mean_and_deviation_of_each_channel(make_network: MakeNetwork) -> None:
     np.testing.assert_allclose(source.infer(np.tile(pixel, (16, 32, 1))), wanted, rtol=1e-5)
 
 
-def test_half_precision_is_taken(make_network: MakeNetwork) -> None:
-    source = opened(make_network(kind=10))
-    np.testing.assert_allclose(source.infer(image(51)), 0.2, rtol=1e-3)
-
-
-def test_images_are_resized_to_the_network(make_network: MakeNetwork) -> None:
-    assert opened(make_network()).infer(image(51, 64, 100)).shape == (16, 32)
-    dynamic = make_network("dynamic.onnx", (1, 3, "height", "width"))
-    assert opened(dynamic, height=28, width=42).infer(image(51, 64, 100)).shape == (28, 42)
-
-
 def test_depth_and_disparity_are_told_apart_and_unknown_pixels_stay_unknown(make_network: MakeNetwork) -> None:
     frame = Frame(0, 0.0, np.concatenate([image(0), image(255)], axis=1)[:, ::2].copy())
     path = make_network(gain=2.0)
@@ -94,11 +83,6 @@ def test_a_network_without_an_end_is_ended(make_network: MakeNetwork, monkeypatc
     monkeypatch.setattr(onnx_depth, "_MOST_S", 0.5)
     with pytest.raises(SlamError, match=r"has no answer to an image of 32x16 after 0\.5 s"):
         opened(path)
-
-
-def test_an_output_can_be_chosen(make_network: MakeNetwork) -> None:
-    source = opened(make_network(outputs=2, gain=2.0, shift=1.0), output_name="scaled")
-    np.testing.assert_allclose(source.infer(image(51)), 0.4, rtol=1e-6)
 
 
 def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from threading import Barrier, Event
 
-import pytest
-
 from slam.runtime.threads import read_ahead
 
 
@@ -33,13 +31,3 @@ def test_two_threads_read_at_once_and_in_order() -> None:
         return number
 
     assert list(read_ahead(read, range(6), threads=2)) == [0, 1, 2, 3, 4, 5]
-
-
-def test_an_error_of_reading_is_raised_in_order() -> None:
-    def read(number: int) -> int:
-        return 1 // (2 - number)
-
-    numbers = read_ahead(read, range(1, 4))
-    assert next(numbers) == 1
-    with pytest.raises(ZeroDivisionError):
-        next(numbers)

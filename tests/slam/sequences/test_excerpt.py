@@ -1,11 +1,7 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from slam.runtime.errors import SequenceError
-from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import Excerpt, frame_range
+from slam.sequences.excerpt import frame_range
 from slam.sequences.poses import rebased
 from slam.sequences.recording import Source
 
@@ -23,25 +19,6 @@ from slam.sequences.recording import Source
 )
 def test_ranges(text: str, wanted: tuple[int, int]) -> None:
     assert frame_range(text, 10) == wanted
-
-
-def test_excerpt_of_an_excerpt(tmp_path: Path, odometry) -> None:
-    odometry(tmp_path, frames=10)
-    outer = open_sequence(tmp_path, "00", None, "2:9")
-    assert isinstance(outer, Excerpt)
-    inner = Excerpt(outer, 1, 4)
-    assert len(inner) == 3 and inner.name == "00"
-    assert inner.provenance() == ("kitti_odometry/00[3:6]",)
-    assert inner.stamps == pytest.approx([0.3, 0.4, 0.5])
-    frame = inner.frame(2)
-    assert (frame.index, frame.stamp, frame.image[0, 0, 0]) == (2, pytest.approx(0.5), 50)
-    assert inner.reference is not None
-    assert np.array_equal(inner.reference[0], np.eye(4))
-    assert inner.reference[2, :3, 3] == pytest.approx([0, 0, 2])
-    with pytest.raises(SequenceError, match="no frame 3 "):
-        inner.frame(3)
-    with pytest.raises(SequenceError, match="no frames 2:9"):
-        Excerpt(inner, 2, 9)
 
 
 def test_sources_are_clipped_to_the_named_recording() -> None:

@@ -56,17 +56,3 @@ def test_registered_depth_maps_belong_to_the_images_of_their_stamps(folder: Path
     sequence = open_sequence(folder)
     assert isinstance(sequence, RecordedSequence) and sequence.true_depth_frames() == [0, 1]
     np.testing.assert_array_equal(sequence.true_depth(1), np.full((4, 6), 2.0))
-
-
-@pytest.mark.parametrize("camera, focal", [("1", None), ("3", (535.4, 539.2))])
-def test_the_benchmark_s_own_cameras_need_no_file(
-    tmp_path: Path, images, camera_yaml: str, camera: str, focal: tuple[float, float] | None
-) -> None:
-    """Images of freiburg1 are undistorted, those of freiburg3 are without distortion; a file comes first."""
-    folder = tmp_path / f"rgbd_dataset_freiburg{camera}_desk"
-    images(folder / "rgb", ["1.png", "2.png"], 640, 480)
-    (folder / "rgb.txt").write_text("1.0 rgb/1.png\n1.1 rgb/2.png\n")
-    K = open_sequence(folder).intrinsics
-    assert (K.fx, K.fy) == focal if focal else 300 < K.fx < 517 or 517.4 < K.fx < 700
-    (folder / "camera.yaml").write_text(camera_yaml.replace("40", "640").replace("24", "480").replace("30", "500"))
-    assert open_sequence(folder).intrinsics.fx == 500

@@ -76,18 +76,6 @@ def test_uneven_frame_times_are_used(tmp_path: Path, camera_64: str, caplog: pyt
     assert "has 20.77 frames a second, the camera has 5: taken as even at the camera's rate" in caplog.text
 
 
-def test_even_frames_have_the_rate_of_the_video(
-    tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = write_mp4(tmp_path / "phone.mp4", [120 * k for k in range(12)])
-    camera = tmp_path / "camera.yaml"
-    for fps, stamps in (("5.02", np.arange(12) / 5.02), ("5.4", np.arange(12) / 5), ("10", np.arange(12) / 10)):
-        assert "frames a second" not in caplog.text
-        camera.write_text(camera_64.replace("fps: 5", f"fps: {fps}"))
-        assert open_sequence(path).stamps == pytest.approx(stamps, abs=1e-9), fps
-    assert "phone.mp4 has 5 frames a second, the camera has 10: taken as even at the camera's rate" in caplog.text
-
-
 def test_a_field_of_view_takes_the_rate_of_the_video(tmp_path: Path) -> None:
     path = write_mp4(tmp_path / "phone.mp4", [24 * k for k in range(8)])
     sequence = open_sequence(path, camera=Path("fov=90"))
@@ -105,23 +93,6 @@ def test_frames_and_times_of_a_long_video_are_those_of_its_packets(
     sequence = open_sequence(path, camera=Path("fov=70"))
     assert sequence.stamps == pytest.approx(np.array(UNEVEN) / 600, abs=5e-4)
     assert ("announces 14 frames and has 10" in caplog.text) == (suffix == ".mkv")
-
-
-def test_frames_before_the_cut_of_a_trimmed_video_are_not_counted(tmp_path: Path) -> None:
-    """Phones cut by a list beside the frames: packets before the cut stay in the file, to be decoded and not shown."""
-    av = pytest.importorskip("av")
-    path, cut = write_mp4(tmp_path / "whole.mp4", [20 * k for k in range(12)]), tmp_path / "cut.mp4"
-    with av.open(str(path)) as whole, av.open(str(cut), "w", options={"avoid_negative_ts": "disabled"}) as trimmed:
-        stream = trimmed.add_stream_from_template(whole.streams.video[0])
-        for packet in whole.demux(whole.streams.video[0]):
-            if packet.size:
-                packet.pts, packet.dts = (time - round(0.1 / packet.time_base) for time in (packet.pts, packet.dts))
-                packet.stream = stream
-                trimmed.mux(packet)
-    for counted_frames in (3000, 4):
-        frames = VideoFrames(cut, counted_frames)
-        assert (len(frames), frames.fps) == (9, pytest.approx(30))
-        assert frames.times_s() == pytest.approx(np.arange(9) / 30, abs=1e-4)
 
 
 def test_a_rotation_flag_turns_the_images(tmp_path: Path) -> None:

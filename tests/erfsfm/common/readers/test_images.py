@@ -49,12 +49,6 @@ def test_twelve_bits_in_sixteen_are_refused(tmp_path: Path, channels: int) -> No
     assert read_image(path).max() == 0, "a black image is accepted"
 
 
-def test_depth_maps_keep_their_values(tmp_path: Path) -> None:
-    depth = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
-    cv2.imwrite(str(tmp_path / "d.png"), depth)
-    np.testing.assert_array_equal(read_values(tmp_path / "d.png"), depth)
-
-
 @pytest.mark.parametrize("read", [read_image, read_values, image_size])
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.97])
@@ -97,21 +91,6 @@ def test_natural_order_ignores_other_files(tmp_path: Path) -> None:
     assert [p.name for p in list_images(tmp_path)] == ["img1.PNG", "img2.png", "img10.png"]
     assert list_images(tmp_path / "nowhere") == []
     assert has_images(tmp_path) and not has_images(tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ["1700000000.001911", "1700000000.1008093", "1700000000.2", "1700000000.3000495", "1700000001.0"],
-        ["left_9.5", "left_10.125", "left_10.5"],
-        ["cam0.2", "cam0.10", "cam1.3"],
-        ["2024.1.2", "2024.1.10"],
-    ],
-)
-def test_a_stamp_is_one_number_in_natural_order(tmp_path: Path, names: list[str]) -> None:
-    for name in names:
-        (tmp_path / f"{name}.png").write_bytes(b"")
-    assert [path.stem for path in list_images(tmp_path)] == names
 
 
 def test_resize_down_averages() -> None:

@@ -76,19 +76,6 @@ def test_an_uncounted_video_is_decoded_once_in_order(tmp_path: Path, monkeypatch
     assert called.count("grab") == wanted[-1] + 1
 
 
-def test_a_seek_to_another_frame_is_detected(tmp_path: Path) -> None:
-    frames = VideoFrames(write_video(tmp_path / "a.avi"))
-    frames._times_ms = [time + 1 for time in frames._times_ms]
-    assert decoded(frames.read(50)) == 50
-    assert decoded(frames.read(5)) == 5
-
-
-def test_returned_images_may_be_written(tmp_path: Path) -> None:
-    frames = VideoFrames(write_video(tmp_path / "a.avi"))
-    frames.read(5)[:] = 255
-    assert decoded(frames.read(5)) == 5
-
-
 def test_a_damaged_video_is_one_line_in_a_process_of_its_own(tmp_path: Path) -> None:
     """The decoder would print lines of its own past Python."""
     path = tmp_path / "a.mp4"

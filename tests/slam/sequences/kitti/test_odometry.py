@@ -76,14 +76,6 @@ def test_missing_times_fall_back(tmp_path: Path, odometry, caplog: pytest.LogCap
     assert "times.txt" in caplog.text
 
 
-def test_without_poses_or_lidar_calibration(tmp_path: Path, odometry) -> None:
-    folder = odometry(tmp_path, poses=False)
-    calib = (folder / "calib.txt").read_text()
-    (folder / "calib.txt").write_text(calib[: calib.index("Tr")])
-    sequence = open_sequence(tmp_path, "00", None, None)
-    assert sequence.reference is None and sequence.T_camera_lidar is None
-
-
 def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str) -> None:
     odometry(tmp_path, name="sim")
     (tmp_path / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.52\n")
@@ -94,14 +86,6 @@ def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str) -> None:
     (tmp_path / "simulation.json").write_text("{}")
     with pytest.raises(SequenceError, match="must hold the simulation's seed"):
         open_sequence(tmp_path, None, None, None)
-
-
-def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml: str) -> None:
-    odometry(tmp_path)
-    path = tmp_path / "mine.yaml"
-    path.write_text(camera_yaml.replace("fx: 30", "fx: 33") + "camera_height_m: unknown\n")
-    sequence = open_sequence(tmp_path, "00", path, None)
-    assert sequence.intrinsics.fx == 33 and sequence.camera_height_m is None
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import pytest
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_names
-from slam.sequences.kitti.raw import drive_sources
 
 FRAMES = 5
 DATE = "2011_09_26"
@@ -89,13 +88,6 @@ def test_root_with_several_drives(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="has 2 sequences"):
         open_sequence(tmp_path, None, None, None)
     assert open_sequence(tmp_path, f"{DATE}_drive_0014", None, None).name == f"{DATE}_drive_0014"
-
-
-def test_alias_in_the_odometry_benchmark() -> None:
-    labels = [source.label(100) for source in drive_sources("2011_09_30_drive_0033")]
-    assert labels == ["kitti_raw/2011_09_30_drive_0033[0:100]", "kitti_odometry/09[0:100]"]
-    _, alias = drive_sources("2011_09_30_drive_0028")
-    assert alias.shifted(1100).label(4071) == "kitti_odometry/08[0:4071]"
 
 
 def test_optional_parts(tmp_path: Path) -> None:

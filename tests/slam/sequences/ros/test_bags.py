@@ -51,19 +51,6 @@ def test_opens(new_bag: NewBag, kind: str) -> None:
     assert open_sequence(path.parent, frames="1:3").name == "walk"
 
 
-def test_several_cameras_are_listed_and_named_by_their_topics(new_bag: NewBag, kind: str) -> None:
-    bag = new_bag(kind)
-    drive(bag)
-    drive(bag, "/cam1/image_raw")
-    bag.image("/depth/image_raw", FIRST_NS, np.ones((24, 40), np.uint16), "16UC1")
-    path = bag.close()
-    with pytest.raises(SequenceError, match="has 2 sequences: /cam0/image_raw, /cam1/image_raw; choose one"):
-        open_sequence(path)
-    assert open_sequence(path, "/cam1/image_raw").name == "walk_cam1_image_raw"
-    with pytest.raises(SequenceError, match=r"no sequence /cam2/image_raw in .*: found /cam0"):
-        open_sequence(path, "/cam2/image_raw")
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
     bag = new_bag(kind)
@@ -102,19 +89,6 @@ def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: i
     image = open_sequence(bag.close()).frame(0).image
     assert image.shape == (24, 40, 3) and np.ptp(image) == 0
     assert image[0, 0, 0] == pytest.approx(level, abs=16)  # video levels of YUV are stretched
-
-
-@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
-def test_red_stays_red(new_bag: NewBag, encoding: str) -> None:
-    if encoding.startswith("bayer"):
-        cell = {"r": 200, "g": 20, "b": 20}
-        pixels = np.tile(np.array([cell[c] for c in encoding[6:10]], np.uint8).reshape(2, 2), (12, 20))
-    else:
-        pixels = np.tile(np.array([200, 20, 20] if encoding == "rgb8" else [20, 20, 200], np.uint8), (24, 40, 1))
-    bag = new_bag()
-    bag.camera_info("/c/camera_info", CAMERA, "", ())
-    bag.image("/c/image", FIRST_NS, pixels, encoding)
-    assert open_sequence(bag.close()).frame(0).image[12, 20].tolist() == [200, 20, 20]
 
 
 def test_calibration(new_bag: NewBag, kind: str) -> None:
@@ -199,12 +173,3 @@ def compressed(new_bag: NewBag, kind: str, count: int, damaged: Collection[int])
         message = bag.make("sensor_msgs/msg/CompressedImage", header=header, format="png", data=cut)
         bag.write("/c/image/compressed", FIRST_NS + k * STEP_NS, message)
     return bag.close()
-
-
-@pytest.mark.parametrize("damaged", [0, 1])
-def test_a_damaged_image_is_one_frame_alone(new_bag: NewBag, kind: str, damaged: int) -> None:
-    sequence = open_sequence(compressed(new_bag, kind, 4, {damaged}))
-    with pytest.raises(SequenceError, match=r"an image of /c/image/compressed in .* is truncated"):
-        sequence.frame(damaged)
-    for k in {2, 0, 1, 3} - {damaged}:
-        assert np.array_equal(sequence.frame(k).image, picture(k, 3)[:, :, ::-1])

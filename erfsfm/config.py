@@ -224,9 +224,6 @@ class TrainingConfig(Section):
     )
     gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
     validate_every: int = Field(default=1000, ge=1, description="steps between validations")
-    patience: int = Field(
-        default=0, ge=0, description="validations without improvement after which training stops; 0: never"
-    )
     checkpoint_every: int = Field(default=500, ge=1, description="steps between checkpoints")
     log_every: int = Field(default=50, ge=1, description="steps between log entries")
     precision: Precision = Field(

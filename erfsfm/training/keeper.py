@@ -1,15 +1,14 @@
-"""Weights that a run writes: the latest, the best, and their records; and when no better ones are waited for."""
+"""Weights that a run writes: the latest, the best, and their records."""
 
 from __future__ import annotations
 
-import logging
 import math
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, EarlyStopping, WeightAveraging
+from lightning.pytorch.callbacks import Callback, WeightAveraging
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 import erfsfm
@@ -18,9 +17,7 @@ from erfsfm.common.errors import TrainingError
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.config import TrainedNetworks
 from erfsfm.model_record import ModelRecord, commit, read_record
-from erfsfm.training.module import DECISIVE, SelfSupervision, decisive
-
-logger = logging.getLogger(__name__)
+from erfsfm.training.module import SelfSupervision, decisive
 
 
 class Average(WeightAveraging):
@@ -163,25 +160,6 @@ class WeightKeeper(Callback):
     def load_state_dict(self, state_dict: dict[str, list[str]]) -> None:
         """Add the recordings trained on before the interruption."""
         self._seen = merge([*self._seen, *state_dict["seen"]])
-
-
-class Patience(EarlyStopping):
-    """Ends a run after some validations without improvement; those that measured nothing do not count."""
-
-    def __init__(self, validations: int) -> None:
-        super().__init__(
-            DECISIVE, patience=validations, strict=False, check_finite=False, check_on_train_epoch_end=False
-        )
-
-    def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Decide, and say so: Lightning's own words would come at a level that is silenced."""
-        super().on_validation_end(trainer, module)
-        if self.wait_count >= self.patience and trainer.is_global_zero:
-            logger.info("stopped at step %d: no better in %d validations", trainer.global_step, self.wait_count)
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on with what was seen before the interruption, and with the patience that is configured now."""
-        super().load_state_dict({**state_dict, "patience": self.patience})
 
 
 def _all_finite(module: SelfSupervision) -> bool:

@@ -31,8 +31,6 @@ from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_ob
 _CONSTANT = 1e-3
 _CONSTANT_STEPS = 100
 
-DECISIVE = "decisive"  # the name under which `decisive` is logged
-
 
 class SelfSupervision(lightning.LightningModule):
     """Depth and pose networks trained together from the photometric error between frames.
@@ -238,12 +236,9 @@ class SelfSupervision(lightning.LightningModule):
         self.depth_input = DepthInput.model_validate(depth_input) if depth_input else None
 
     def on_validation_epoch_end(self) -> None:
-        """Note and log what the first process measured, by which all of them decide what to keep and when to stop."""
+        """Note and log what the first process measured, by which all of them decide what to keep."""
         self.validation_metrics = self.trainer.strategy.broadcast(self.measured())
         self.log_dict({f"validation/{name}": value for name, value in self.validation_metrics.items()})
-        measure = decisive(self.validation_metrics, self.config.training.networks)
-        if math.isfinite(measure):
-            self.log(DECISIVE, measure, logger=False)
 
     def measured(self) -> dict[str, float]:
         """Mean of every metric, and the spread of the depth scale, which limits a SLAM system's scale drift."""

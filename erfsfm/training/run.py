@@ -39,13 +39,12 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
-from erfsfm.training.keeper import Average, Patience, WeightKeeper
+from erfsfm.training.keeper import Average, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
 from erfsfm.training.precision import has_bfloat16
 from erfsfm.training.progress import StepProgress
-from erfsfm.training.reach import without_gradient
 from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
@@ -278,13 +277,12 @@ def _trainer(
     # Lightning's CSV log starts by deleting an older one of its name
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
-    stops = [Patience(training.patience)] if training.patience else []
     average = [callbacks[0].average] if callbacks[0].average else []
     several = training.devices > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
         devices=training.devices,
-        strategy=DDPStrategy(find_unused_parameters=bool(without_gradient(config))) if several else "auto",
+        strategy=DDPStrategy(find_unused_parameters=True) if several else "auto",
         sync_batchnorm=several and not on_cpu,
         use_distributed_sampler=False,  # each process has its own draws, and all validate everything
         precision=precision,
@@ -296,7 +294,7 @@ def _trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, *callbacks, *stops, *average],
+        callbacks=[latest, *callbacks, *average],
         plugins=[AtomicCheckpoints()],
         enable_progress_bar=False,
         enable_model_summary=False,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from erfsfm.common.files import read_bytes
-from erfsfm.common.onnx_session import open_session, run_limited
+from erfsfm.common.onnx_session import open_session
 from erfsfm.common.readers.images import resize_image
 from erfsfm.common.readers.pinhole import MOST_PIXELS
 from erfsfm.inference import NETWORK_THREADS
@@ -30,7 +30,6 @@ from slam.runtime.errors import SlamError
 from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 _MOST_BYTES = 2**31  # of a message of Protocol Buffers
-_MOST_S = 120.0  # for one image
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _OWN_INPUT = "RGB in [-1, 1]"  # as `erfsfm export` writes it into the metadata
 
@@ -89,12 +88,7 @@ class OnnxDepth:
         tensor = values.transpose(2, 0, 1) if self._shape[-3] == 3 else values
         tensor = np.ascontiguousarray(tensor[(None,) * (len(self._shape) - 3)], _TYPES[self._input.type])
         try:
-            output = run_limited(self._session, self._output, {self._input.name: tensor}, _MOST_S)
-        except TimeoutError as error:
-            raise SlamError(
-                f"{self._path} has no answer to an image of {self._width}x{self._height} after {_MOST_S:g} s: give "
-                "another network, or smaller depth.height and depth.width"
-            ) from error
+            (output,) = self._session.run([self._output], {self._input.name: tensor})
         except self._errors() as error:
             raise SlamError(
                 f"{self._path} fails on an image of {self._width}x{self._height}: {_short(error)}"

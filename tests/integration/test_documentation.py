@@ -89,8 +89,8 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/commands/calibration renders them"),
     (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_many_view_truth.py has a short one"),
     (r"benchmark.py full-size ", "it wants images at the size of KITTI's cameras, and half an hour"),
-    (r"compare.py ", "it wants ORB-SLAM3 in an environment of its own; tests/tools/test_compare.py runs the rest"),
-    (r"benchmark.py handheld ", "it wants data sets, or minutes a room; tests/tools/test_handheld.py has tiny folders"),
+    (r"compare.py ", "it wants ORB-SLAM3 in an environment of its own"),
+    (r"benchmark.py handheld ", "it wants data sets, or minutes a room"),
     (r"benchmark.py speed ", "it wants another checkout; tests/tools/test_benchmark.py has the parts"),
     (r"label_errors.py", "it wants drive 0013"),
     (

@@ -269,21 +269,6 @@ def test_the_last_step_is_validated(both: Configure, tmp_path: Path, monkeypatch
     assert record.step == 4 and record.metrics["abs_rel"] == 0.1
 
 
-@pytest.mark.parametrize(
-    ("patience", "end"), [(0, 8), (2, 6), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, 3), (4, 8)))]
-)
-def test_patience_ends_a_run_also_after_a_resume(
-    both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patience: int, end: int
-) -> None:
-    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.1, 0.4, 0.1, math.nan, 0.2])
-    training = {"steps": 8, "validate_every": 1, "checkpoint_every": 1, "patience": patience}
-    config = both(training=training)
-    assert load_model(train(config, tmp_path / "whole", device="cpu") / "last").record.step == end
-    interrupted(monkeypatch, config, tmp_path / "cut", 2)
-    assert load_model(train(config, tmp_path / "cut", resume=True, device="cpu") / "last").record.step == end
-    assert same(tmp_path / "whole", tmp_path / "cut")
-
-
 class Clock:
     """Time that passes by one second a step."""
 

@@ -12,7 +12,6 @@ import pytest
 
 from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
-from slam.prediction import onnx_depth
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.runtime.errors import SlamError
 from slam.runtime.storage.cache import CacheNamespace, DiskCache
@@ -62,27 +61,6 @@ def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: Mak
         match=r"must be floats of one map \(1, 1, H, W\) of at most 67,108,864 pixels; got float32 \(2, 14, 14\)",
     ):
         opened(path, height=14, width=28)
-
-
-def test_a_network_without_an_end_is_ended(make_network: MakeNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = make_network()
-    model = onnx.load_model(path)
-    yes = onnx.helper.make_tensor("yes", onnx.TensorProto.BOOL, [], [True])
-    value = [onnx.helper.make_tensor_value_info(name, 1, None) for name in ("state", "next")]
-    flags = [onnx.helper.make_tensor_value_info(name, 9, []) for name in ("before", "after")]
-    count = onnx.helper.make_tensor_value_info("count", 7, [])
-    nodes = [
-        onnx.helper.make_node("Identity", ["before"], ["after"]),
-        onnx.helper.make_node("Sqrt", ["state"], ["next"]),
-    ]
-    body = onnx.helper.make_graph(nodes, "body", [count, flags[0], value[0]], [flags[1], value[1]])
-    model.graph.node[-1].output[0] = "once"
-    model.graph.node.append(onnx.helper.make_node("Loop", ["", "yes", "once"], ["depth"], body=body))
-    model.graph.initializer.append(yes)
-    onnx.save(model, path)
-    monkeypatch.setattr(onnx_depth, "_MOST_S", 0.5)
-    with pytest.raises(SlamError, match=r"has no answer to an image of 32x16 after 0\.5 s"):
-        opened(path)
 
 
 def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path) -> None:

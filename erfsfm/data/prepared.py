@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from erfsfm.common.config_tree import Section, dump_yaml, first_problem
-from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress
 from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import NetworkConfig
@@ -122,11 +122,8 @@ def write_prepared(
         progress: told of the stage, what is done, and of how many.
 
     Raises:
-        ConfigError: ``output`` is taken.
         DataError: no image can be read.
     """
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise ConfigError(f"--prepare {output} is not empty: choose a new folder; nothing was changed")
     length, middle = network.sources + 1, network.sources // 2
     snippets = [snippet.recording.part(snippet.first, snippet.first + length) for snippet in held_out]
     recordings = [*training, *snippets]

@@ -114,10 +114,16 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
     """Write the frames and labels of a training to a folder, to train from elsewhere; see `write_prepared`.
 
     Raises:
-        ConfigError: ``output`` is taken.
-        DataError: nothing to train on, or another training than this would come of it.
+        ConfigError: ``output`` is taken, or the last part of each recording is to validate on.
+        DataError: nothing to train on.
         TrainingError: the teacher cannot measure a drive.
     """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise ConfigError(f"--prepare {output} is not empty: choose a new folder; nothing was changed")
+    if config.data.validation_share > 0:  # it would be taken off again
+        raise ConfigError(
+            "--prepare keeps whole recordings to validate on: set data.validation, and data.validation_share=0"
+        )
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
     _, measured = by_label(training, config.data)
@@ -125,12 +131,6 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
     with tempfile.TemporaryDirectory() as temporary:
         teacher = measured_views(measured, config, config.teacher.cache or Path(temporary), progress)
         write_prepared(output, training, held_out, teacher, config.network, progress)
-    again, _ = split_recordings(config.data.model_copy(update={"roots": [output]}))
-    if trained_on(again) != trained_on(training):
-        raise DataError(
-            f"{output} would train on {trained_on(again)}, not on {trained_on(training)}: set data.validation instead "
-            "of data.validation_share"
-        )
 
 
 def _require_devices(wanted: int, device: str) -> None:

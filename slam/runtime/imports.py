@@ -21,8 +21,6 @@ EXTRAS: dict[str, tuple[str, tuple[str, ...], type[SlamError]]] = {
         ("remotezip", "requests", "urllib3.exceptions"),
         DownloadError,
     ),
-    "geotiff": ("GeoTIFF needs rasterio", ("rasterio",), SlamError),
-    "las": ("LAS and LAZ need laspy and lazrs", ("lazrs", "laspy"), SlamError),
     "live": ("--publish needs pyzmq", ("zmq",), SlamError),
     "rerun": ("--rerun and --view need rerun", ("rerun",), SlamError),
     "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys"), SequenceError),

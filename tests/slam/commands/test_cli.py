@@ -152,8 +152,6 @@ def test_wrong_usage_exits_with_2(call: Call, arguments: list[str]) -> None:
         (["evaluate", "a.txt", "b.txt"], "a.txt: no such file"),
         (["evaluate", "."], "not a run folder"),
         (["export", "nowhere", "--what", "mesh", "--output", "m.ply"], "nowhere is not a run folder"),
-        (["export", "nowhere", "--what", "mesh", "--output", "m.ply", "--crop", "1,2"], "x0,x1,y0,y1,z0,z1"),
-        (["export", "nowhere", "--what", "raster", "--output", "r", "--origin", "north"], "LAT,LON,HEADING"),
         (["plot", "nowhere"], "nowhere is not a run folder"),
         (["simulate", "world", "--route", "maze"], "maze"),
         (["simulate", "world", "--frames", "20"], "a loop closes within 250"),
@@ -342,27 +340,12 @@ def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run:
     [
         ("mesh", "a/map.ply", "ply"),
         ("cloud", "map.ply", "ply"),
-        ("trajectory", "poses.txt", "1.0"),
-        ("trajectory", "poses.tum", "# timestamp"),
-        ("graph", "graph.g2o", "VERTEX_SE3:QUAT 0"),
-        ("mesh", "map.gltf", '{"asset"'),
     ],
 )
 def test_export(call: Call, make_run: MakeRun, what: str, output: str, start: str) -> None:
     run = make_run()
     code, out, _ = call("export", run.path, "--what", what, "--output", output)
     assert code == 0 and output in out and Path(output).read_bytes().startswith(start.encode())
-
-
-def test_export_of_a_part(call: Call, make_run: MakeRun) -> None:
-    """A box may begin with a minus."""
-    run = make_run()
-    box = ("--crop", "-1,2,-3,1,0,2")
-    assert call("export", run.path, "--what", "mesh", "--output", "a.glb", *box, "--voxel", 0.1)[0] == 0
-    code, _, err = call("export", run.path, "--what", "mesh", "--output", "b.glb", "--crop", "5,6,5,6,5,6")
-    assert code == 1 and err.count("\n") == 1 and "nothing of the map lies inside" in err
-    assert call("export", run.path, "--what", "raster", "--output", "raster", "--resolution", 0.5)[0] == 0
-    assert Path("raster/raster.yaml").is_file() and not Path("b.glb").exists()
 
 
 def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:

@@ -73,7 +73,7 @@ _RUN = ("--dataset", "in/root", "--weights", WEIGHTS, "--frames", "0:4", *QUICK_
 VERBS = (
     Verb("erfsfm-slam", "run", _RUN),
     Verb("erfsfm-slam", "evaluate", (f"{RUN}/trajectory_network.tum.txt", f"{RUN}/reference.tum.txt")),
-    Verb("erfsfm-slam", "export", (RUN, "--what", "raster", "--output", "out")),
+    Verb("erfsfm-slam", "export", (RUN, "--what", "mesh", "--output", "out.ply")),
     Verb("erfsfm-slam", "simulate", ("--route", "straight", "--frames", "2", "--width", "16", "--height", "16", "out")),
     Verb("erfsfm-slam", "plot", (RUN, "--output", "out.png")),
     Verb("erfsfm-slam", "localize", (IMAGES, "--map", RUN, "--frames", "0:1", "--output", "out.tum")),

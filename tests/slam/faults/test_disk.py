@@ -128,7 +128,7 @@ def verbs(kitti_root: Path, tiny_weights: Path, whole: Path, tmp_path: Path) -> 
     return {
         "run": (slam_main, [*run, *quick, "--output", out / "run"]),
         "simulate": (slam_main, ["simulate", out / "root", "--route", "straight", "--frames", "2", "--width", "64"]),
-        "export mesh": (slam_main, [*export, out / "mesh.glb", "--what", "mesh"]),
+        "export mesh": (slam_main, [*export, out / "mesh.ply", "--what", "mesh"]),
         "export colmap": (slam_main, [*export, out / "model", "--what", "colmap"]),
         "plot": (slam_main, ["plot", whole, "--output", out / "plot.png"]),
         "predict": (erfsfm_main, ["predict", tmp_path / "two", "--weights", tiny_weights, "--output", out / "depth"]),

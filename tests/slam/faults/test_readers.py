@@ -29,7 +29,6 @@ from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise, read_pose_noise, write_pose_noise
 from slam import run_slam
 from slam.config.sections import load_config
-from slam.formats.g2o import check_g2o
 from slam.formats.ply import coloured_ply, read_ply, write_ply
 from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.geometry import se3
@@ -98,7 +97,6 @@ READERS = (
     Reader("places.npz", "run/places.npz", Places.read),
     Reader("drive.zip", "run/drive.zip", SessionCheckpoint.read),
     Reader("keyframes.npz", "run/keyframes.npz", lambda path: SessionCheckpoint.open(path.parent)),
-    Reader("graph.g2o", "run/graph.g2o", check_g2o),
     Reader("PLY", "mesh.ply", read_ply, lambda ply: bool(np.isfinite(ply.points).all())),
     Reader("model.yaml", "weights/model.yaml", lambda path: load_model(path.parent)),
     Reader("safetensors", "weights/depth.safetensors", lambda path: load_model(path.parent)),

@@ -43,7 +43,9 @@ from slam.sequences.catalogue import open_sequence
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SHELL = ("", "sh", "bash", "shell", "console")
-PROGRAMS = ("erfsfm", "erfsfm-slam", "make", "pip", "python")
+BIN = Path(sys.executable).parent
+EVO = ("evo_traj", "evo_ape", "evo_res")
+PROGRAMS = ("erfsfm", "erfsfm-slam", "make", "pip", "python", *EVO)
 ADVICE = "add what it names to the workspace of this test, or a line to SHORTER or NOT_RUN"
 
 WIDTH, HEIGHT, FRAMES, FIRST_RUN, RAW_FRAMES = 208, 64, 20, 14, 9
@@ -58,6 +60,7 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(erfsfm-slam simulate .*)--frames \d+", r"\1--frames 12"),
     (r"^erfsfm train .*", r"\g<0> --set training.steps=2 --set training.batch=2"),
     (r"^(erfsfm pack --config tiny .* --output) pack", r"\1 again"),  # the workspace has it, to train from
+    (r"--save_results optimised.zip", "--save_results again.zip"),  # the same
     (r"--split eigen", "--split my_frames.txt"),  # the 697 frames of Eigen are not here
     (r"^erfsfm receptive-field (?!.*--images).*", rf"\g<0> --width {WIDTH} --height {HEIGHT}"),
     (r"--dataset ROOT --sequence (NAME|\d\d)", "--dataset KITTI --sequence 05"),
@@ -193,8 +196,9 @@ OTHERS = [block for block in commands() if reason_not_to_run(block.text)]
 def call(command: str) -> None:
     """Run a command line in the current folder; our two programs in this process, for the time it saves."""
     program, *arguments = shlex.split(command)
-    if program == "python":
-        words = [sys.executable, str(ROOT / arguments[0]), *arguments[1:]]
+    if program == "python" or program in EVO:
+        started = [sys.executable, str(ROOT / arguments.pop(0))] if program == "python" else [str(BIN / program)]
+        words = [*started, *arguments]
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         finished = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
         assert finished.returncode == 0, finished.stdout + finished.stderr
@@ -287,6 +291,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         raw_drive(Path("KITTI_RAW"), Path("scanned/sequences/sim"))
         Path("my_frames.txt").write_text("2011_09_26_drive_0013 5\n")
         call(f"erfsfm-slam run --dataset KITTI --sequence 09 --frames 0:{FIRST_RUN}")
+        for name in ("network", "optimised"):
+            files = f"results/latest/reference.kitti.txt results/latest/trajectory_{name}.kitti.txt"
+            call(f"evo_ape kitti {files} -as --save_results {name}.zip")
         Path("poses").mkdir()
         rows = Path("KITTI/poses/09.txt").read_text().splitlines(keepends=True)
         Path("poses/09.txt").write_text("".join(rows[:FIRST_RUN]))

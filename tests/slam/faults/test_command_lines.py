@@ -75,7 +75,6 @@ VERBS = (
     Verb("erfsfm-slam", "evaluate", (f"{RUN}/trajectory_network.tum.txt", f"{RUN}/reference.tum.txt")),
     Verb("erfsfm-slam", "export", (RUN, "--what", "mesh", "--output", "out.ply")),
     Verb("erfsfm-slam", "simulate", ("--route", "straight", "--frames", "2", "--width", "16", "--height", "16", "out")),
-    Verb("erfsfm-slam", "plot", (RUN, "--output", "out.png")),
     Verb("erfsfm-slam", "localize", (IMAGES, "--map", RUN, "--frames", "0:1", "--output", "out.tum")),
     Verb("erfsfm-slam", "calibrate", (IMAGES, "--board", "5x4", "--output", "out.yaml"), quick=False),
     Verb("erfsfm-slam", "doctor", ("--dataset", "in/root"), quick=False),

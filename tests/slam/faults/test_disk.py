@@ -130,7 +130,6 @@ def verbs(kitti_root: Path, tiny_weights: Path, whole: Path, tmp_path: Path) -> 
         "simulate": (slam_main, ["simulate", out / "root", "--route", "straight", "--frames", "2", "--width", "64"]),
         "export mesh": (slam_main, [*export, out / "mesh.ply", "--what", "mesh"]),
         "export colmap": (slam_main, [*export, out / "model", "--what", "colmap"]),
-        "plot": (slam_main, ["plot", whole, "--output", out / "plot.png"]),
         "predict": (erfsfm_main, ["predict", tmp_path / "two", "--weights", tiny_weights, "--output", out / "depth"]),
         "train": (erfsfm_main, [*_TRAINING, "--dataset", kitti_root, "--output", out / "training"]),
     }  # fmt: skip
@@ -140,7 +139,7 @@ def verbs(kitti_root: Path, tiny_weights: Path, whole: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "name",
     [
-        *("run", "simulate", "export mesh", "export colmap", "plot", "predict"),
+        *("run", "simulate", "export mesh", "export colmap", "predict"),
         pytest.param("train", marks=pytest.mark.slow),
     ],
 )
@@ -219,7 +218,7 @@ def test_a_real_disk_that_is_full(
     if not mounted:
         pytest.skip("mounting is not allowed here")
     try:
-        for name in ("run", "simulate", "export mesh", "plot", "predict"):
+        for name in ("run", "simulate", "export mesh", "predict"):
             main, words = verbs[name]
             (disk / "filler").write_bytes(bytes(60_000))
             assert call(main, words) == 1

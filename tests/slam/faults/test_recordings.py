@@ -74,10 +74,6 @@ def _are_drives(drives: Any) -> bool:
 
 
 NUSCENES = ("scene", "sample", "sensor", "calibrated_sensor", "ego_pose", "sample_data")
-ARGOVERSE = (
-    *("calibration/intrinsics", "calibration/egovehicle_SE3_sensor", "city_SE3_egovehicle"),
-    f"sensors/lidar/{FIRST_NS + 2 * STEP_NS}",
-)
 FILES = (
     _recording("folder/times.txt", 1),
     _recording("folder/camera.yaml", 1),
@@ -94,7 +90,6 @@ FILES = (
     _recording("scene0000_00/pose/20.txt", 2),
     *(_recording(f"nuscenes/v1.0-mini/{name}.json", 2, "scene-0061") for name in NUSCENES),
     _recording("nuscenes/samples/LIDAR_TOP/2.pcd.bin", 3, "scene-0061"),
-    *(_recording(f"argoverse/{name}.feather", name.count("/") + 1) for name in ARGOVERSE),
     _recording("walk.bag", 0),
     _recording("walk/walk.mcap", 1),
     _recording("walk/metadata.yaml", 1),
@@ -109,7 +104,7 @@ FILES = (
 def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small recording of each layout."""
     place = tmp_path_factory.mktemp("recordings")
-    for write in (_folder, _euroc, _tum_mono, _tum, _seven_scenes, _scannet, _nuscenes, _argoverse, _bags, _texts):
+    for write in (_folder, _euroc, _tum_mono, _tum, _seven_scenes, _scannet, _nuscenes, _bags, _texts):
         write(place)
     return place
 
@@ -199,29 +194,6 @@ def _nuscenes(place: Path) -> None:
     }
     for name, rows in tables.items():
         _write(root / f"v1.0-mini/{name}.json", json.dumps(rows))
-
-
-def _argoverse(place: Path) -> None:
-    import pyarrow
-    from pyarrow import feather
-
-    root, stamps = place / "argoverse", [FIRST_NS + k * STEP_NS for k in range(-1, FRAMES + 1)]
-    _images(root / "sensors/cameras/ring_front_center", [f"{ns}.jpg" for ns in stamps[1:-1]])
-    size: dict[str, list[Any]] = {"width_px": [WIDTH], "height_px": [HEIGHT], "k1": [-0.1]}
-    focal = {"fx_px": [30.0], "fy_px": [30.0], "cx_px": [20.0], "cy_px": [12.0]}
-    camera = {"sensor_name": ["ring_front_center"]}
-    turned = {f"q{axis}": [value] for axis, value in zip("wxyz", AHEAD, strict=True)}
-    still = dict.fromkeys(("qx", "qy", "qz", "ty_m", "tz_m"), [0.0] * len(stamps)) | {"qw": [1.0] * len(stamps)}
-    tables: dict[str, dict[str, Any]] = {
-        ARGOVERSE[0]: camera | focal | size,
-        ARGOVERSE[1]: camera | turned | {"tx_m": [1.6], "ty_m": [0.0], "tz_m": [1.4]},
-        ARGOVERSE[2]: {"timestamp_ns": stamps, "tx_m": [float(k) for k in range(len(stamps))]} | still,
-        ARGOVERSE[3]: {axis: np.array([1, 2], np.float16) for axis in "xyz"},
-    }
-    for name, columns in tables.items():
-        path = root / f"{name}.feather"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        feather.write_feather(pyarrow.table(columns), path)
 
 
 def _bags(place: Path) -> None:

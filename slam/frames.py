@@ -269,15 +269,12 @@ class TrackingEvent:
 
 @dataclass(frozen=True)
 class MeasuredPosition:
-    """A measured ``position`` ``(3,)`` of a point of the camera at a frame, in axes of its own, metres.
-
-    ``sigmas`` ``(3,)`` are along these axes, ``lever_arm`` ``(3,)`` is the point in the camera.
-    """
+    """A measured ``position`` ``(3,)`` of the camera at a frame, in axes of its own, metres; ``sigmas`` ``(3,)`` are
+    along these axes."""
 
     index: int
     position: FloatArray
     sigmas: FloatArray
-    lever_arm: FloatArray
 
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:

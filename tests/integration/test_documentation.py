@@ -473,12 +473,8 @@ def test_every_python_block_runs(block: Block, at_work: Path) -> None:
 
 
 @pytest.mark.parametrize("block", blocks("yaml", "yml"))
-def test_every_camera_file_and_manifest_opens(block: Block, tmp_path: Path) -> None:
+def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
     camera = yaml.safe_load(block.text)
-    if "drives" in camera:
-        (tmp_path / "drives.yaml").write_text(block.text)
-        assert len(drives_of(tmp_path / "drives.yaml", ["all"], [])) == len(camera["drives"])
-        return
     assert "fx" in camera, f"{block}: this test reads camera.yaml only; add this kind of YAML"
     for k in range(6):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((camera["height"], camera["width"], 3), 90 + k, np.uint8))
@@ -486,8 +482,14 @@ def test_every_camera_file_and_manifest_opens(block: Block, tmp_path: Path) -> N
     assert len(open_sequence(tmp_path)) == 6
 
 
+@pytest.mark.parametrize("block", blocks("csv"))
+def test_every_manifest_opens(block: Block, tmp_path: Path) -> None:
+    (tmp_path / "drives.csv").write_text(block.text)
+    assert len(drives_of(tmp_path / "drives.csv", ["all"], [])) == len(block.text.splitlines()) - 1
+
+
 def test_every_fence_is_of_a_known_language() -> None:
-    known = (*SHELL, "python", "py", "yaml", "yml", "text", "bibtex", "toml")
+    known = (*SHELL, "python", "py", "yaml", "yml", "text", "csv", "bibtex", "toml")
     every = [block for document in DOCUMENTS for block in fenced(document)]
     strange = [f"{block} {block.language}" for block in every if block.language not in known]
     assert not strange, "say here how to run them, or call them text"

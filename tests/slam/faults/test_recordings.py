@@ -95,7 +95,6 @@ FILES = (
     _recording("walk/metadata.yaml", 1),
     File("track.csv", read_gps, _is_track),
     File("track.nmea", read_gps, _is_track),
-    File("drives.yaml", _drives, _are_drives),
     File("drives.csv", _drives, _are_drives),
 )
 
@@ -243,7 +242,6 @@ def _texts(place: Path) -> None:
     _write(place / "track.csv", "stamp, latitude, longitude, altitude\n" + fixes)
     fix = "$GPGGA,12351{k},4807.03{k},N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,\n"
     _write(place / "track.nmea", "".join(fix.format(k=k) for k in range(4)))
-    _write(place / "drives.yaml", "drives:\n  - {name: one, dataset: a, options: [--frames, '0:9']}\n  - dataset: b\n")
     _write(place / "drives.csv", "name,dataset,options\none,a,--frames 0:9\ntwo,b,\n")
 
 

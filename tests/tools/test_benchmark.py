@@ -75,12 +75,11 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache(tmp_path: Path) -> None:
+def test_plan_has_every_combination(tmp_path: Path) -> None:
     drives = [plan.BenchmarkSequence(name, tmp_path) for name in ("a", "b")]
     jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.min_inliers=25"])
     assert len(jobs) == len({job.place for job in jobs}) == 2 * 2 * 3 * len(plan.ABLATION)
     assert {job.configuration.name for job in jobs[:12]} == {plan.EVERYTHING.name}
-    assert len({job.cache for job in jobs}) == 4
     assert all(job.arguments[-2:] == ["--set", "loops.min_inliers=25"] for job in jobs)
 
 
@@ -203,9 +202,8 @@ def test_only_successful_runs_of_the_same_sources_are_kept(job: Any, monkeypatch
             (job.place / "run" / "metrics.json").write_text(metrics().to_json())
         return subprocess.CompletedProcess(words, code, "", "")
 
-    monkeypatch.setattr(work, "revision", lambda: "abc")
+    monkeypatch.setattr(work, "revision", lambda: "first")
     monkeypatch.setattr(work.subprocess, "run", run)
-    monkeypatch.setattr(work, "fingerprint", lambda weights: "first")
     work.perform(job)
     assert work.job_result(job).reason == "killed by SIGKILL"
     work.perform(job)
@@ -213,24 +211,9 @@ def test_only_successful_runs_of_the_same_sources_are_kept(job: Any, monkeypatch
     assert (len(runs), work.job_result(job).reason) == (2, "")
     work.perform(replace(job, device="cuda"))
     assert len(runs) == 3
-    monkeypatch.setattr(work, "fingerprint", lambda weights: "second")
+    monkeypatch.setattr(work, "revision", lambda: "second")
     work.perform(replace(job, device="cuda"))
     assert len(runs) == 4
-
-
-def test_the_fingerprint_depends_on_sources_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(work, "ROOT", tmp_path)
-    for name in (*work.SOURCES, "weights"):
-        (tmp_path / name).mkdir()
-    seen = {work.fingerprint("default")}
-    (tmp_path / "slam" / "run.py").write_text("1")
-    seen.add(work.fingerprint("default"))
-    (tmp_path / "weights" / "model.safetensors").write_text("2")
-    seen.add(work.fingerprint(str(tmp_path / "weights")))
-    (tmp_path / "slam" / "__pycache__").mkdir()
-    (tmp_path / "slam" / "__pycache__" / "run.pyc").write_text("3")
-    seen.add(work.fingerprint(str(tmp_path / "weights")))
-    assert len(seen) == 3
 
 
 def test_dask_runs_every_job_once(tmp_path: Path) -> None:

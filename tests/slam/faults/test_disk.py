@@ -233,16 +233,6 @@ def test_a_real_disk_that_is_full(
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_a_cache_on_a_full_disk_is_one_warning(
-    verbs: dict[str, Verb], call: Call, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    main, words = verbs["run"]
-    with FailingDisk("write", 2, tmp_path / "cache").mounted():
-        assert call(main, [*words, "--cache", tmp_path / "cache"]) == 0
-    assert caplog.text.count("the cache is not written any more") == 1
-    assert RunFolder.open(tmp_path / "out" / "run").metrics().tree()["status"] == "ok"
-
-
 def test_a_full_folder_for_temporary_files_is_one_line(
     verbs: dict[str, Verb],
     call: Call,

@@ -97,12 +97,6 @@ def test_a_folder_of_another_program_is_refused_before_any_work(
     assert contents(tmp_path) == {name: text.encode() for name, text in content.items()}
 
 
-def test_one_folder_is_not_both_cache_and_run(quick: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="--cache and --output are one folder"):
-        run_slam(**(quick | {"output": tmp_path / "run", "cache": tmp_path / "run"}))
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_data_set_is_no_place_for_a_run(quick: dict[str, Any], copy_of_kitti_root: CopyRoot) -> None:
     root = copy_of_kitti_root()
     before = contents(root)

@@ -96,12 +96,10 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"compare.py ", "it wants ORB-SLAM3 in an environment of its own; tests/tools/test_compare.py runs the rest"),
     (r"benchmark.py handheld ", "it wants data sets, or minutes a room; tests/tools/test_handheld.py has tiny folders"),
     (r"benchmark.py speed ", "it wants another checkout; tests/tools/test_benchmark.py has the parts"),
-    (r"label_errors.py", "it wants drive 0013"),
     (
         r"train-fusion|runs/fusion|--seed 1[01]00",
         "it wants worlds; tests/erfsfm/training/test_fusion.py has small ones",
     ),
-    (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
     (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/live has folders and videos that go on"),
     (r"slam_node.py", "rclpy is no dependency; tests/slam/commands/live runs its callbacks"),
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),

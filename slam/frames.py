@@ -5,7 +5,6 @@ The front end, the graph and the map never import each other; ``slam/pipeline/ba
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Collection, Hashable
 from concurrent.futures import Executor
@@ -91,15 +90,6 @@ class Frame:
     def grey(self) -> Grey:
         """Grey levels ``(H, W)`` uint8."""
         return self.derived("grey", lambda: np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY), np.uint8))
-
-    @property
-    def digest(self) -> bytes:
-        """SHA-256 of shape and pixels: the cache key of the image."""
-
-        def digest() -> bytes:
-            return hashlib.sha256(repr(self.image.shape).encode() + self.image.tobytes()).digest()
-
-        return self.derived("digest", digest)
 
 
 class Sequence(Protocol):
@@ -269,15 +259,12 @@ class TrackingEvent:
 
 @dataclass(frozen=True)
 class MeasuredPosition:
-    """A measured ``position`` ``(3,)`` of a point of the camera at a frame, in axes of its own, metres.
-
-    ``sigmas`` ``(3,)`` are along these axes, ``lever_arm`` ``(3,)`` is the point in the camera.
-    """
+    """A measured ``position`` ``(3,)`` of the camera at a frame, in axes of its own, metres; ``sigmas`` ``(3,)`` are
+    along these axes."""
 
     index: int
     position: FloatArray
     sigmas: FloatArray
-    lever_arm: FloatArray
 
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:

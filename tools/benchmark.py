@@ -3,8 +3,8 @@
 accuracy measures simulated worlds and KITTI sequences, full-size the same worlds and KITTI at the size of KITTI's
 cameras, ablation turns off one part at a time, maps the errors of the map with one of its parts turned off at a time,
 handheld cameras that are carried: data sets beside published marks, folders of images, simulated rooms.
-Every run is a process and a folder of its own under --output. A successful one is not repeated as long as sources,
-weights and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its reason.
+Every run is a process and a folder of its own under --output. A successful one is not repeated as long as commit
+and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its reason.
 --jobs and --scheduler need Dask: pip install 'erfsfm-slam[cluster]'. A scheduler's workers need the same files at the
 same paths. kitti runs whole sequences of KITTI odometry, 09 and 10 first, and says first how long that will take. speed
 measures two checkouts in turn: time, memory and stages; nothing of it is kept.

@@ -4,7 +4,7 @@ The ratios of ``VisualOdometryConfig`` (jitter, turns, neighbours) are those of 
 every drive has the same weight. For each drive the table has the coverage of its steps with the ratios in use, and with
 ratios fitted to all other drives.
 
-Example: python tools/fit_step_noise.py KITTI:00 KITTI:02 KITTI:05 WORLD --weights sim --cache cache
+Example: python tools/fit_step_noise.py KITTI:00 KITTI:02 KITTI:05 WORLD --weights sim
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from slam.geometry.se3 import FloatArray, invert, umeyama
 from slam.pipeline.batch import SlamPipeline
 from slam.prediction.networks import NetworkPredictor
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.cache import CacheNamespace, DiskCache, without_cache
 from slam.sequences.catalogue import open_sequence
 
 QUIET = ("mapping.enabled=false", "loops.enabled=false")
@@ -108,7 +107,7 @@ def fit(drives: Sequence[DriveSteps]) -> FloatArray:
     return np.asarray(np.exp(minimize(loss, start[0], method="Nelder-Mead", options=options).x))
 
 
-def measure(name: str, networks: DepthPosePredictor, cache: Path | None) -> DriveSteps:
+def measure(name: str, networks: DepthPosePredictor) -> DriveSteps:
     """The steps of a recording with true poses, ``ROOT`` or ``ROOT:SEQUENCE``.
 
     Raises:
@@ -118,8 +117,7 @@ def measure(name: str, networks: DepthPosePredictor, cache: Path | None) -> Driv
     recording = open_sequence(Path(root), sequence or None)
     if recording.reference is None:
         raise SlamError(f"{name} has no true poses: give a recording with poses")
-    answers = without_cache if cache is None else CacheNamespace(DiskCache(cache), networks.sha256).get_or_compute
-    predictor = NetworkPredictor(networks, recording.intrinsics, answers=answers)
+    predictor = NetworkPredictor(networks, recording.intrinsics)
     config = load_config(None, QUIET)
     found = SlamPipeline(recording, predictor, config, noise=networks.noise).estimate()
     T_true = np.array(recording.reference)
@@ -140,10 +138,9 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = parser_of(__doc__)
     parser.add_argument("drives", nargs="+", metavar="ROOT[:SEQUENCE]", help="recordings with true poses")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--cache", type=Path, help="cache folder of the networks' outputs")
     options = parser.parse_args(words)
     networks = DepthPosePredictor.from_weights(options.weights, runtime="onnx")
-    drives = [measure(name, networks, options.cache) for name in options.drives]
+    drives = [measure(name, networks) for name in options.drives]
     shown = Table("drive", "steps", "50 / 90 / 95 %, in use", "50 / 90 / 95 %, fitted to the others")
     for drive in drives:
         others = fit([other for other in drives if other is not drive])

@@ -1,4 +1,4 @@
-"""The verbs ``evaluate`` and ``plot`` of the command line."""
+"""The verb ``evaluate`` of the command line."""
 
 from __future__ import annotations
 
@@ -14,22 +14,16 @@ from slam.runtime.terminal import print_table
 
 verbs = typer.Typer()
 
-Format = Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the files")]
-Reference = Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")]
-Frames = Annotated[str | None, typer.Option(help="A:B of the reference, half-open")]
-
 
 @verbs.command()
 def evaluate(
     paths: Annotated[
         list[str], typer.Argument(help="ESTIMATE REFERENCE (two files), or run folders; with --reference any of both")
     ],
-    reference: Reference = None,
-    frames: Frames = None,
-    format: Format = "auto",
+    reference: Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B of the reference, half-open")] = None,
+    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the files")] = "auto",
     csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
-    latex: Annotated[Path | None, typer.Option(help="the table, with --reference")] = None,
-    plot: Annotated[Path | None, typer.Option(help="png, pdf or svg of all trajectories, with --reference")] = None,
     fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
     as_json: Json = False,
     seed: UnusedSeed = 0,
@@ -41,14 +35,14 @@ def evaluate(
     --reference: one table of any number of files and runs. NAME=PATH names a system; of several with one NAME the table
     has mean and deviation.
 
-    Example: erfsfm-slam evaluate ours=results/latest "orb=orb_*.txt" --reference poses/09.txt --plot systems.png
+    Example: erfsfm-slam evaluate ours=results/latest "orb=orb_*.txt" --reference poses/09.txt
     """
     if reference is not None:
-        _compare(paths, reference, frames, format, fail_over or [], as_json, csv, latex, plot)
+        _compare(paths, reference, frames, format, fail_over or [], as_json, csv)
         return
     files = [Path(path) for path in paths]
-    if frames or csv or latex or plot:
-        raise typer.BadParameter("--frames, --csv, --latex and --plot need --reference FILE")
+    if frames or csv:
+        raise typer.BadParameter("--frames and --csv need --reference FILE")
     if all(path.is_dir() for path in files):
         if fail_over:
             raise typer.BadParameter("a limit applies to trajectory files: give --reference", param_hint="--fail-over")
@@ -63,37 +57,6 @@ def evaluate(
         raise typer.BadParameter(f"give two trajectory files, run folders that exist, or --reference FILE; got {given}")
 
 
-@verbs.command()
-def plot(
-    runs: Annotated[list[str], typer.Argument(help="run folders side by side; with files all over each other")],
-    what: Annotated[str, typer.Option(help="comma list of trajectory, errors, drift")] = "trajectory",
-    output: Annotated[Path, typer.Option(help="png, pdf or svg")] = Path("plot.png"),
-    reference: Reference = None,
-    frames: Frames = None,
-    format: Format = "auto",
-    seed: UnusedSeed = 0,
-    device: UnusedDevice = "auto",
-) -> None:
-    """Figures of runs, or of trajectory files over each other, for a paper.
-
-    Example: erfsfm-slam plot results/latest --what trajectory,errors --output figure.pdf
-    """
-    from slam.results.folder import RunFolder
-    from slam.results.report.plots import plot_runs, plot_systems
-    from slam.results.systems import by_name, compare, named_paths, trajectory_at
-
-    panels = what.split(",")
-    if reference is not None:
-        plot_systems(by_name(compare(named_paths(runs), reference, format, frames)), panels, output)
-    elif frames is not None:
-        raise typer.BadParameter("--frames needs --reference FILE")
-    elif all(Path(run).is_dir() or not Path(run).suffix for run in runs):
-        plot_runs([RunFolder.open(run) for run in runs], panels, output)
-    else:
-        plot_systems({name: trajectory_at(path, format) for name, path in named_paths(runs)}, panels, output)
-    typer.echo(f"figure in {output}")
-
-
 def _compare(
     paths: list[str],
     reference: Path,
@@ -102,24 +65,16 @@ def _compare(
     limits: list[str],
     as_json: bool,
     csv: Path | None,
-    latex: Path | None,
-    plot: Path | None,
 ) -> None:
     from slam.evaluation.trajectory import exceeded
     from slam.results.output_file import check_replaced
-    from slam.results.report.plots import plot_systems
-    from slam.results.systems import by_name, compare, named_paths, systems_table, write_csv, write_latex
+    from slam.results.systems import compare, named_paths, systems_table, write_csv
 
-    for file, beginning in ((csv, {".csv": b"system,path"}), (latex, {".tex": rb"\begin{tabular}"})):
-        if file is not None:
-            check_replaced(file, beginning)
+    if csv is not None:
+        check_replaced(csv, {".csv": b"system,path"})
     runs = compare(named_paths(paths), reference, format, frames)
     if csv is not None:
         write_csv(runs, csv)
-    if latex is not None:
-        write_latex(runs, latex)
-    if plot is not None:
-        plot_systems(by_name(runs), ["trajectory", "errors"], plot)
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:

@@ -124,10 +124,6 @@ class GpsConfig(Section):
     vertical_sigma_m: float = Field(default=5.0, gt=0, description="sigma of the height of a fix, metres")
     correlation_s: float = Field(default=10.0, ge=0, description="time for which fixes share their error, seconds")
     offset_s: float = Field(default=0.0, description="added to the stamps of the fixes, seconds")
-    lever_arm_m: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, 0.0),
-        description="position of the antenna in the camera's axes: x right, y down, z ahead, metres",
-    )
 
 
 class ScaleConfig(Section):

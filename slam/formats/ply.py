@@ -48,11 +48,6 @@ class Ply:
         return np.stack([self.vertices[name].astype(np.float64) for name in _AXES], axis=1)
 
     @property
-    def normals(self) -> FloatArray | None:
-        """Normals ``(V, 3)``, None where the file has none."""
-        return self.columns(_NORMALS)
-
-    @property
     def colours(self) -> NDArray[np.uint8] | None:
         """RGB ``(V, 3)``, None where the file has none."""
         colours = self.columns(_COLOURS)
@@ -62,11 +57,6 @@ class Ply:
     def colours_or_grey(self) -> NDArray[np.uint8]:
         """RGB ``(V, 3)``, a middle grey where the file has none."""
         return np.full((len(self.vertices), 3), 128, np.uint8) if self.colours is None else self.colours
-
-    def extra_fields(self) -> list[str]:
-        """Names of the fields besides position, normal and colour."""
-        known = {*_AXES, *_NORMALS, *_COLOURS}
-        return [name for name in self.vertices.dtype.names or () if name not in known]
 
 
 @dataclass

@@ -120,13 +120,14 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
 
 
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
-    """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically.
+    """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically; after its number where it has one.
 
     Raises:
         TrajectoryError: if the file cannot be written.
     """
     rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
-    _write(Path(path), (_row(row) for row in rows))
+    numbers = (f"{stamp:.0f} " if trajectory.numbered else "" for stamp in trajectory.stamps)
+    _write(Path(path), (number + _row(row) for number, row in zip(numbers, rows)))
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:

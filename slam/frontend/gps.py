@@ -38,10 +38,9 @@ class GpsFixes:
 
     Attributes:
         stamps: seconds ``(M,)`` on the clock of the images.
-        points: east, north, up of the antenna ``(M, 3)``, metres.
+        points: east, north, up ``(M, 3)``, metres; the antenna is taken to be at the camera.
         sigmas: of single fixes ``(M, 3)``, metres.
         widening: factor on the sigmas for a graph, which takes errors as independent.
-        lever_arm: the antenna ``(3,)`` in the camera, metres.
         frame: where east, north, up begin.
     """
 
@@ -49,13 +48,11 @@ class GpsFixes:
     points: FloatArray
     sigmas: FloatArray
     widening: float
-    lever_arm: FloatArray
     frame: LocalFrame
 
-    def antenna(self, T_any_camera: FloatArray, stamps: FloatArray) -> FloatArray:
-        """Positions of the antenna ``(M, 3)`` at the fixes, from camera poses ``(N, 4, 4)`` at ``stamps`` ``(N,)``."""
-        positions = antenna_positions(T_any_camera, self.lever_arm)
-        return np.column_stack([np.interp(self.stamps, stamps, positions[:, axis]) for axis in range(3)])
+    def camera(self, T_any_camera: FloatArray, stamps: FloatArray) -> FloatArray:
+        """Positions of the camera ``(M, 3)`` at the fixes, from its poses ``(N, 4, 4)`` at ``stamps`` ``(N,)``."""
+        return np.column_stack([np.interp(self.stamps, stamps, T_any_camera[:, axis, 3]) for axis in range(3)])
 
 
 def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes | MeasurementFailure:
@@ -73,7 +70,7 @@ def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes
     sigmas = np.array([config.sigma_m, config.sigma_m, config.vertical_sigma_m]) * dilution[:, None]
     widening = float(np.sqrt(max(config.correlation_s / float(np.median(np.diff(times))), 1.0)))
     points = frame.points(track.places[inside])
-    return GpsFixes(times, points, sigmas, widening, np.array(config.lever_arm_m), frame)
+    return GpsFixes(times, points, sigmas, widening, frame)
 
 
 def scale_by_gps(
@@ -85,7 +82,7 @@ def scale_by_gps(
     several of them where these span less than 20 sigmas, and are chosen by the camera's lengths: choosing by GPS would
     prefer chords that errors lengthen.
     """
-    estimated = fixes.antenna(T_world_camera_unscaled, stamps)
+    estimated = fixes.camera(T_world_camera_unscaled, stamps)
     sigma = float(np.median(fixes.sigmas[:, 0]))
     least = _LEAST_MOTION_SIGMAS * sigma
 
@@ -116,7 +113,7 @@ def scale_by_gps(
 
 def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> FloatArray | MeasurementFailure:
     """``T_enu_world`` ``(4, 4)`` by the fixes, robustly; about a straight path by the camera's own up."""
-    camera = fixes.antenna(T_world_camera, stamps)
+    camera = fixes.camera(T_world_camera, stamps)
     sigma = fixes.sigmas * fixes.widening
     extent = float(np.ptp(fixes.points[:, :2], axis=0).max())
     least = _LEAST_MOTION_SIGMAS * float(np.median(sigma[:, 0]))
@@ -141,8 +138,8 @@ def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> Fl
 
 
 def offsets(fixes: GpsFixes, T_enu_camera: FloatArray, stamps: FloatArray) -> FloatArray:
-    """From the fixes to the antenna of the path at their times ``(M, 3)``, east, north and up."""
-    return fixes.antenna(T_enu_camera, stamps) - fixes.points
+    """From the fixes to the path at their times ``(M, 3)``, east, north and up."""
+    return fixes.camera(T_enu_camera, stamps) - fixes.points
 
 
 def positions_at_frames(
@@ -151,11 +148,6 @@ def positions_at_frames(
     """Every fix at the frame nearest in time, moved there by the camera's own motion."""
     frames = nearest_stamps(fixes.stamps, stamps)
     T_enu_camera = T_enu_world @ T_world_camera
-    moved = antenna_positions(T_enu_camera, fixes.lever_arm)[frames] - fixes.antenna(T_enu_camera, stamps)
+    moved = T_enu_camera[frames, :3, 3] - fixes.camera(T_enu_camera, stamps)
     rows = zip(frames.tolist(), fixes.points + moved, fixes.widening * fixes.sigmas, strict=True)
-    return [MeasuredPosition(index, point, sigmas, fixes.lever_arm) for index, point, sigmas in rows]
-
-
-def antenna_positions(T_any_camera: FloatArray, lever_arm: FloatArray) -> FloatArray:
-    """Positions ``(N, 3)`` of a point fixed to the camera, from its poses ``(N, 4, 4)``."""
-    return np.asarray(T_any_camera[:, :3, :3] @ lever_arm + T_any_camera[:, :3, 3])
+    return [MeasuredPosition(index, point, sigmas) for index, point, sigmas in rows]

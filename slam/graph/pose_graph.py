@@ -234,7 +234,7 @@ def _between(edge: RelativePose, config: PoseGraphConfig) -> Any:
 
 def _position(measured: MeasuredPosition, config: PoseGraphConfig) -> Any:
     noise = _noise(measured.sigmas, config)
-    return gtsam.GPSFactorArm(measured.index, measured.position, measured.lever_arm, noise)
+    return gtsam.GPSFactor(measured.index, measured.position, noise)
 
 
 def _noise(sigmas: FloatArray, config: PoseGraphConfig) -> Any:

@@ -1,8 +1,6 @@
-"""The predictor of a run, assembled from networks, cache and the source of depth."""
+"""The predictor of a run, assembled from networks and the source of depth."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 from erfsfm.inference import DepthPosePredictor
 from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
@@ -13,8 +11,6 @@ from slam.prediction.networks import NetworkPredictor
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_plug_in, plug_ins
-from slam.runtime.storage.cache import CacheNamespace, DiskCache
-from slam.runtime.storage.fingerprint import code_fingerprint
 
 
 def open_depth(
@@ -48,21 +44,8 @@ def open_depth(
 
 
 def make_predictor(
-    networks: DepthPosePredictor,
-    source: DepthSource | None,
-    config: DepthConfig,
-    intrinsics: Intrinsics,
-    cache: Path | None = None,
+    networks: DepthPosePredictor, source: DepthSource | None, config: DepthConfig, intrinsics: Intrinsics
 ) -> Predictor:
-    """The networks, behind the cache where one is given, with depth by ``source`` where there is one."""
-    if cache is None:
-        own = NetworkPredictor(networks, intrinsics)
-    else:
-        disk, code = DiskCache(cache), code_fingerprint()
-        # outputs of GPU and CPU differ a little and share no entries
-        identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device} {code}"
-        own = NetworkPredictor(networks, intrinsics, CacheNamespace(disk, identity).get_or_compute)
-        if isinstance(source, OnnxDepth):
-            identity = f"{source.identity} {source.runtime} {code}"
-            source.use_cache(CacheNamespace(disk, identity).get_or_compute)
+    """The networks, with depth by ``source`` where there is one."""
+    own = NetworkPredictor(networks, intrinsics)
     return own if source is None else SourcedPredictor(own, source, config.align)

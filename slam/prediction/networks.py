@@ -1,8 +1,4 @@
-"""The trained networks behind the ``Predictor`` protocol: frames in, snippet poses and depth out.
-
-Outputs of the networks can be cached. Their key is the networks' identity and the digest of each image; disparity is
-cached at the size and precision of the network.
-"""
+"""The trained networks behind the ``Predictor`` protocol: frames in, snippet poses and depth out."""
 
 from __future__ import annotations
 
@@ -17,7 +13,6 @@ from numpy.typing import NDArray
 from erfsfm.inference import depth_at, limit_torch_threads
 from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
-from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 
 class Networks(Protocol):
@@ -38,19 +33,17 @@ class Networks(Protocol):
 class NetworkPredictor:
     """Depth and snippet poses of the frames of one sequence, by the networks."""
 
-    def __init__(self, networks: Networks, intrinsics: Intrinsics, answers: GetOrCompute = without_cache) -> None:
+    def __init__(self, networks: Networks, intrinsics: Intrinsics) -> None:
         """Predict for the frames of one sequence.
 
         Args:
             networks: depth and pose network.
             intrinsics: of all images.
-            answers: a cache of outputs of these networks.
         """
         self._networks = networks
         self._intrinsics = intrinsics
-        self._answers = answers
         self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
-        self._key = object()  # key of outputs cached in frames, which outlive the networks
+        self._key = object()  # key of outputs kept in frames, which outlive the networks
         self.sources = networks.sources
 
     def executor(self) -> Executor:
@@ -64,11 +57,7 @@ class NetworkPredictor:
 
     def snippet(self, frames: Sequence[Frame], with_residuals: bool = True) -> SnippetPoses:
         """Poses of the sources of a snippet, and their residuals if wanted; the target is the middle frame."""
-
-        def compute() -> Answer:
-            return (self._networks.poses([self._prepared(frame) for frame in frames]),)
-
-        (T_source_target,) = self._answers("poses", frames, compute)
+        T_source_target = self._networks.poses([self._prepared(frame) for frame in frames])
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
         residuals = None
@@ -84,10 +73,7 @@ class NetworkPredictor:
         return self._residual.ratios(thumbnails, disparity, T_source_target)
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:
-        def compute() -> Answer:
-            return (self._networks.disparity(self._prepared(frame)),)
-
-        return frame.derived((self._key, "disparity"), lambda: self._answers("disparity", [frame], compute)[0])
+        return frame.derived((self._key, "disparity"), lambda: self._networks.disparity(self._prepared(frame)))
 
     def _prepared(self, frame: Frame) -> Any:
         return frame.derived((self._key, "prepared"), lambda: self._networks.prepare(frame.image))

@@ -27,7 +27,6 @@ from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
 from slam.prediction.depth_source import Disparity, Kind, disparity_of
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 _MOST_BYTES = 2**31  # of a message of Protocol Buffers
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -58,21 +57,11 @@ class OnnxDepth:
         self._output = self._depth_output(config)
         numbers = (self._mean.tolist(), self._std.tolist(), self._height, self._width, self._output)
         self.identity = f"onnx {self.sha256} {self._kind} {config.align} {numbers}"
-        self.runtime = f"onnxruntime {onnxruntime.__version__}"
-        self._answers: GetOrCompute = without_cache
         self._run(np.zeros((self._height, self._width, 3), np.uint8))
-
-    def use_cache(self, answers: GetOrCompute) -> None:
-        """Keep outputs in a cache of this network alone."""
-        self._answers = answers
 
     def disparity(self, frame: Frame) -> Disparity:
         """1/depth at the network's own size, NaN where unknown; raises as ``infer``."""
-
-        def compute() -> Answer:
-            return (disparity_of(self.infer(frame.image), self._kind),)
-
-        return self._answers("onnx disparity", [frame], compute)[0]
+        return disparity_of(self.infer(frame.image), self._kind)
 
     def infer(self, image: Image) -> NDArray[np.float32]:
         """The network's output ``(h, w)`` for an image ``(H, W, 3)`` uint8 RGB.

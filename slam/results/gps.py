@@ -1,19 +1,16 @@
-"""A run beside its GPS track: errors for ``metrics.json`` and paths on the earth."""
+"""A run beside its GPS track: errors for ``metrics.json``, and its place on the earth."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from slam.formats.geographic import write_geojson
 from slam.formats.trajectory import Trajectory
 from slam.frontend import gps
 from slam.frontend.failure import MeasurementFailure
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
-from slam.results.folder import RunFolder
 from slam.results.metrics import GpsErrors, GpsMetrics, Origin
-from slam.runtime.run_files import GEOJSON
 from slam.runtime.storage.record import Missing
 
 
@@ -36,15 +33,6 @@ def gps_metrics(result: Estimate, in_graph: bool) -> GpsMetrics | Missing:
         else _errors(location.fixes, aligned, result.odometry),
         optimised=_errors(location.fixes, location.T_enu_world, result.optimised),
     )
-
-
-def write_places(folder: RunFolder, result: Estimate, name: str) -> None:
-    """Write the optimised trajectory as a path on the earth, where a GPS track located it."""
-    if not isinstance(result.location, Location):
-        return
-    T_enu_camera = result.location.T_enu_world @ result.optimised.T_world_camera
-    places = result.location.fixes.frame.places(T_enu_camera[:, :3, 3])
-    write_geojson(folder.path / GEOJSON, name, places, result.optimised.stamps)
 
 
 def _errors(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> GpsErrors:

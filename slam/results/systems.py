@@ -1,10 +1,9 @@
-"""Trajectories of several systems against one reference: their errors as a table, as CSV and as LaTeX."""
+"""Trajectories of several systems against one reference: their errors as a table and as CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -26,7 +25,6 @@ from slam.runtime.terminal import TerminalTable
 from slam.sequences.excerpt import frame_range
 
 _COLUMNS = COLUMNS[:-1]  # without the difference to evo
-_SPECIAL = str.maketrans({c: f"\\{c}" for c in "_%&#$"} | {"±": "$\\pm$", DASH: "--"})
 
 
 @dataclass(frozen=True)
@@ -118,16 +116,6 @@ def systems_table(runs: Sequence[SystemRun], reference: Path) -> TerminalTable:
     return TerminalTable(["system", "poses", *(c.short for c in _COLUMNS)], list(_rows(runs)), title, [UNITS, *notes])
 
 
-def by_name(runs: Sequence[SystemRun]) -> dict[str, Trajectory]:
-    """The trajectories to draw over each other, with the reference of the most poses."""
-    found = {REFERENCE: max((run.reference for run in runs), key=len)}
-    counts = Counter[str]()
-    for run in runs:
-        counts[run.system] += 1
-        found[f"{run.system} #{counts[run.system]}" if counts[run.system] > 1 else run.system] = run.estimate
-    return found
-
-
 def write_csv(runs: Sequence[SystemRun], output: Path) -> None:
     """Every number of every trajectory, a row each; unknown ones are empty.
 
@@ -139,20 +127,8 @@ def write_csv(runs: Sequence[SystemRun], output: Path) -> None:
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)))
     writer.writeheader()
     writer.writerows(rows)
-    _write(output, text.getvalue())
-
-
-def write_latex(runs: Sequence[SystemRun], output: Path) -> None:
-    """The table of systems in the style of the package booktabs.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
-    head = ["system", "poses", *(c.name for c in _COLUMNS)]
-    lines = [" & ".join(cell.translate(_SPECIAL) for cell in row) + r" \\" for row in (head, *_rows(runs))]
-    begin = rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}"
-    table = [begin, r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule", r"\end{tabular}"]
-    _write(output, "\n".join(table) + "\n")
+    content = text.getvalue()
+    write_atomically(output, lambda partial: partial.write_text(content, encoding="utf-8", newline=""), RunError)
 
 
 def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
@@ -179,7 +155,3 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from _flat(value, f"{prefix}{key}.")
         elif not key.endswith("_reason"):
             yield prefix + key, value
-
-
-def _write(output: Path, text: str) -> None:
-    write_atomically(output, lambda partial: partial.write_text(text, encoding="utf-8", newline=""), RunError)

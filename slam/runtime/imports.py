@@ -14,16 +14,12 @@ from slam.runtime.errors import DownloadError, SequenceError, SlamError
 
 # of each optional extra: what needs it, its modules, and the error where one of them cannot be loaded
 EXTRAS: dict[str, tuple[str, tuple[str, ...], type[SlamError]]] = {
-    "argoverse": ("Argoverse 2 needs pyarrow", ("pyarrow.feather",), SequenceError),
     "cluster": ("several workers and schedulers need Dask", ("cloudpickle", "distributed"), SlamError),
     "download": (
         "download needs remotezip and requests",
         ("remotezip", "requests", "urllib3.exceptions"),
         DownloadError,
     ),
-    "geotiff": ("GeoTIFF needs rasterio", ("rasterio",), SlamError),
-    "las": ("LAS and LAZ need laspy and lazrs", ("lazrs", "laspy"), SlamError),
-    "live": ("--publish needs pyzmq", ("zmq",), SlamError),
     "rerun": ("--rerun and --view need rerun", ("rerun",), SlamError),
     "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys"), SequenceError),
 }

@@ -15,7 +15,6 @@ MAP_MESH = "map_mesh.ply"
 MAP_CLOUD = "map_cloud.ply"
 MAP_ABOVE = "map_above.png"
 MAP_DRIVER = "map_driver.png"
-GEOJSON = "trajectory_optimised.geojson"
 REPORT = "report.html"
 LOG = "run.log"
 
@@ -43,7 +42,6 @@ ESTIMATE = trajectory_file("optimised", "tum")  # a folder that holds it holds a
 MEANINGS = {
     CONFIG: "resolved configuration",
     METRICS: "every number of this page",
-    GEOJSON: "optimised trajectory on the earth",
     GRAPH: "pose graph",
     LOOPS: "accepted and rejected loops",
     PLACES: "features of places, for localize",

@@ -13,7 +13,7 @@ from erfsfm.common.readers.video import VIDEO_SUFFIXES
 from slam.frames import Sequence
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.runtime.imports import import_plug_in, plug_ins
-from slam.sequences import argoverse, euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
+from slam.sequences import euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
@@ -37,7 +37,6 @@ LOADERS: tuple[Loader, ...] = (
     seven_scenes.LOADER,
     scannet.LOADER,
     nuscenes.LOADER,
-    argoverse.LOADER,
     folder.LOADER,
     ros.LOADER,
     video.LOADER,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable
-from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -28,8 +27,8 @@ def read_gps(path: Path) -> GpsTrack:
     """Read a GPS track.
 
     CSV has a header with ``stamp`` in seconds on the clock of the images, ``latitude`` and ``longitude`` in degrees,
-    ``altitude`` in metres and, optionally, ``hdop``. Of NMEA, GGA sentences are fixes and RMC sentences give the date:
-    stamps are seconds since 1970, without a date seconds of the first day.
+    ``altitude`` in metres and, optionally, ``hdop``. Of NMEA, GGA sentences are read; their stamps are seconds of the
+    first day.
 
     Raises:
         SequenceError: the file cannot be read or holds something else, with the row.
@@ -95,20 +94,12 @@ def _csv_rows(lines: list[str], path: Path) -> list[list[float]]:
 def _nmea_rows(lines: Iterable[str], path: Path) -> list[list[float]]:
     """The same of GGA sentences with a fix and its altitude; each receiver repeats a fix at most once a stamp."""
     rows: list[list[float]] = []
-    midnight: float | None = None
     for number, line in enumerate(lines, start=1):
         words = _sentence(line)
-        kind = words[0][-3:]
+        if words[0][-3:] != "GGA" or len(words) < 10 or words[6] in ("", "0") or not words[9]:
+            continue
         try:
-            if kind == "RMC" and len(words) > 9 and words[1] and words[9]:
-                day = datetime.strptime(words[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
-                if midnight is None and rows:
-                    first = day + _DAY_S * round((_seconds(words[1]) - rows[-1][0]) / _DAY_S)
-                    rows = [[row[0] + first, *row[1:]] for row in rows]
-                midnight = day
-            if kind != "GGA" or len(words) < 10 or words[6] in ("", "0") or not words[9]:
-                continue
-            stamp = (midnight or 0.0) + _seconds(words[1])
+            stamp = _seconds(words[1])
             if rows and stamp < rows[-1][0] - _DAY_S / 2:
                 stamp += _DAY_S
             fix = [stamp, _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])]

@@ -35,14 +35,15 @@ from onnx import TensorProto, helper
 import erfsfm.cli
 import slam.commands.cli
 from erfsfm.networks.presets import build
-from slam.commands.batch.manifest import drives_of
 from slam.frames import Intrinsics
 from slam.sequences.catalogue import open_sequence
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SHELL = ("", "sh", "bash", "shell", "console")
-PROGRAMS = ("erfsfm", "erfsfm-slam", "make", "pip", "python")
+BIN = Path(sys.executable).parent
+EVO = ("evo_traj", "evo_ape", "evo_res")
+PROGRAMS = ("erfsfm", "erfsfm-slam", "make", "pip", "python", *EVO)
 ADVICE = "add what it names to the workspace of this test, or a line to SHORTER or NOT_RUN"
 
 WIDTH, HEIGHT, FRAMES, FIRST_RUN, RAW_FRAMES = 208, 64, 20, 14, 9
@@ -57,6 +58,7 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(erfsfm-slam simulate .*)--frames \d+", r"\1--frames 12"),
     (r"^erfsfm train .*", r"\g<0> --set training.steps=2 --set training.batch=2"),
     (r"^(erfsfm train .* --prepare) prepared", r"\1 again"),  # the workspace has it, to train from
+    (r"--save_results optimised.zip", "--save_results again.zip"),  # the same
     (r"--split eigen", "--split my_frames.txt"),  # the 697 frames of Eigen are not here
     (r"^erfsfm receptive-field (?!.*--images).*", rf"\g<0> --width {WIDTH} --height {HEIGHT}"),
     (r"--dataset ROOT --sequence (NAME|\d\d)", "--dataset KITTI --sequence 05"),
@@ -92,12 +94,10 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"compare.py ", "it wants ORB-SLAM3 in an environment of its own"),
     (r"benchmark.py handheld ", "it wants data sets, or minutes a room"),
     (r"benchmark.py speed ", "it wants another checkout; tests/tools/test_benchmark.py has the parts"),
-    (r"label_errors.py", "it wants drive 0013"),
     (
         r"train-fusion|runs/fusion|--seed 1[01]00",
         "it wants worlds; tests/erfsfm/training/test_fusion.py has small ones",
     ),
-    (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
     (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/live has folders and videos that go on"),
     (r"slam_node.py", "rclpy is no dependency; tests/slam/commands/live runs its callbacks"),
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
@@ -108,10 +108,6 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
 )
 if importlib.util.find_spec("rerun") is None:
     NOT_RUN = (*NOT_RUN, (r"--rerun ", "the extra 'rerun' is not installed"))
-if importlib.util.find_spec("laspy") is None:
-    NOT_RUN = (*NOT_RUN, (r"\.la[sz]\b", "the extra 'las' is not installed"))
-if importlib.util.find_spec("rasterio") is None:
-    NOT_RUN = (*NOT_RUN, (r"--origin ", "the extra 'geotiff' is not installed"))
 
 
 @dataclass(frozen=True)
@@ -195,8 +191,9 @@ RUNNABLE = [*{block.text: block for block in reversed(commands()) if not reason_
 def call(command: str) -> None:
     """Run a command line in the current folder; our two programs in this process, for the time it saves."""
     program, *arguments = shlex.split(command)
-    if program == "python":
-        words = [sys.executable, str(ROOT / arguments[0]), *arguments[1:]]
+    if program == "python" or program in EVO:
+        started = [sys.executable, str(ROOT / arguments.pop(0))] if program == "python" else [str(BIN / program)]
+        words = [*started, *arguments]
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         finished = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
         assert finished.returncode == 0, finished.stdout + finished.stderr
@@ -289,6 +286,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         raw_drive(Path("KITTI_RAW"), Path("scanned/sequences/sim"))
         Path("my_frames.txt").write_text("2011_09_26_drive_0013 5\n")
         call(f"erfsfm-slam run --dataset KITTI --sequence 09 --frames 0:{FIRST_RUN}")
+        for name, archive in (("network", "chained"), ("optimised", "optimised")):
+            files = f"results/latest/reference.kitti.txt results/latest/trajectory_{name}.kitti.txt"
+            call(f"evo_ape kitti {files} -as --save_results {archive}.zip")
         Path("poses").mkdir()
         rows = Path("KITTI/poses/09.txt").read_text().splitlines(keepends=True)
         Path("poses/09.txt").write_text("".join(rows[:FIRST_RUN]))
@@ -410,7 +410,7 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert names["errors"].ate_rmse_m < 0.8, "0.4 m were measured"
     assert np.isfinite(names["sigmas"]).all() and names["depth_m"].min() > 0
     written = {path.relative_to("first-steps").as_posix() for path in Path("first-steps").rglob("*")}
-    assert {"map.glb", "poses.tum", "model/points3D.txt", "model/images/000119.png", "run/report.html"} <= written
+    assert {"map.ply", "model/points3D.txt", "model/images/000119.png", "run/report.html"} <= written
 
 
 def blocks(*languages: str) -> list[Any]:
@@ -432,12 +432,8 @@ def test_every_python_block_runs(block: Block, at_work: Path) -> None:
 
 
 @pytest.mark.parametrize("block", blocks("yaml", "yml"))
-def test_every_camera_file_and_manifest_opens(block: Block, tmp_path: Path) -> None:
+def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
     camera = yaml.safe_load(block.text)
-    if "drives" in camera:
-        (tmp_path / "drives.yaml").write_text(block.text)
-        assert len(drives_of(tmp_path / "drives.yaml", ["all"], [])) == len(camera["drives"])
-        return
     assert "fx" in camera, f"{block}: this test reads camera.yaml only; add this kind of YAML"
     for k in range(6):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((camera["height"], camera["width"], 3), 90 + k, np.uint8))

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from slam.commands.localisation.accuracy import MapTruth
 
 from slam import run_slam
-from slam.commands.localisation.accuracy import MapTruth
 from slam.commands.localisation.localiser import localise
 from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import invert

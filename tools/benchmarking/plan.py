@@ -33,11 +33,10 @@ class BenchmarkSequence:
 
 @dataclass(frozen=True)
 class Configuration:
-    """Overrides of a run, and whether its drive keeps a cache of the networks' outputs."""
+    """Overrides of a run."""
 
     name: str
     overrides: tuple[str, ...] = ()
-    cache: bool = False
 
 
 _UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
@@ -45,7 +44,7 @@ _NEVER = 1e9  # a limit that no measurement reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 WHOLE = (Configuration("no map", (*QUIET, "mapping.enabled=false")),)
-EVERYTHING = Configuration("everything on", QUIET, True)
+EVERYTHING = Configuration("everything on", QUIET)
 _NO_JITTER = ("visual_odometry.jitter_rotation_ratio=0", "visual_odometry.jitter_direction_ratio=0")
 _NO_TURNS = ("visual_odometry.turn_rotation_ratio=0",)
 _NO_NEIGHBOURS = ("visual_odometry.neighbour_rotation_ratio=0", "visual_odometry.neighbour_direction_ratio=0")
@@ -73,7 +72,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no loop dropped": (f"pose_graph.max_loop_residual={_NEVER}",),
     "no fusion": ("mapping.enabled=false",),
 }
-ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off), True) for name, off in _PARTS.items()))
+ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _PARTS.items()))
 _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "depth not refined": ("depth.refine=none",),
     "depth refined by rules": ("depth.refine=multiview",),
@@ -86,14 +85,14 @@ _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "small pieces kept": ("mapping.min_component_triangles=0",),
     "no loops": ("loops.enabled=false",),
 }
-MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off), True) for name, off in _MAP_PARTS.items()))
+MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _MAP_PARTS.items()))
 FULL_SIZE = 1242, 375  # pixels of KITTI's colour cameras
 ORIGINALS = ("kitti_odometry_original", "failures/kitti03_full")
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of ``erfsfm-slam run``; ``folder`` holds the benchmark's runs and cache."""
+    """One run of ``erfsfm-slam run``; ``folder`` holds the benchmark's runs."""
 
     folder: Path
     drive: BenchmarkSequence
@@ -113,11 +112,6 @@ class Job:
         return self.folder / slug(self.title)
 
     @property
-    def cache(self) -> Path:
-        """Cache folder that the configurations of one drive share."""
-        return self.folder / "cache" / slug(f"{self.drive.name}_{self.weights}")
-
-    @property
     def arguments(self) -> list[str]:
         """Arguments of ``erfsfm-slam``."""
         drive, configuration = self.drive, self.configuration
@@ -126,7 +120,6 @@ class Job:
         words += ["--seed", str(self.seed), "--device", self.device, "--output", str(self.place / "run")]
         words += ["--frames", drive.frames] if drive.frames else []
         words += ["--truth", str(drive.truth)] if drive.truth else []
-        words += ["--cache", str(self.cache)] if configuration.cache else []
         return words + [word for override in configuration.overrides for word in ("--set", override)]
 
 
@@ -139,7 +132,7 @@ def plan(
     changes: Sequence[str] = (),
     device: str = "cpu",
 ) -> list[Job]:
-    """Every combination, configuration by configuration, so that the first one fills the caches for the others."""
+    """Every combination, configuration by configuration."""
     changed = [replace(c, overrides=(*c.overrides, *changes)) for c in configurations]
     return [Job(folder, d, w, c, s, device) for c in changed for s in seeds for w in weights for d in drives]
 

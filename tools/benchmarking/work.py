@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -85,7 +84,7 @@ def perform(job: Job) -> None:
         return
     shutil.rmtree(job.place, ignore_errors=True)
     job.place.mkdir(parents=True)
-    record = {"identity": _identity(job), "commit": revision(), "load": os.getloadavg()[0]}
+    record = {"identity": _identity(job), "load": os.getloadavg()[0]}
     start = time.perf_counter()
     finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
     record |= {"seconds": time.perf_counter() - start, "reason": why_ended(finished.returncode, finished.stderr)}
@@ -101,7 +100,7 @@ def is_done(job: Job) -> bool:
 
 
 def _identity(job: Job) -> dict[str, Any]:
-    return {"arguments": job.arguments, "sources": fingerprint(job.weights)}
+    return {"arguments": job.arguments, "commit": revision()}
 
 
 def job_result(job: Job) -> JobResult:
@@ -110,7 +109,7 @@ def job_result(job: Job) -> JobResult:
 
 
 def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
-    commit, folder = record.get("commit", ""), job.place / "run"
+    commit, folder = record.get("identity", {}).get("commit", ""), job.place / "run"
     reason = record.get("reason", "the benchmark was interrupted")
     metrics = Metrics.read(folder / METRICS) if (folder / METRICS).is_file() else Metrics()
     reason = metrics.failure or reason
@@ -127,16 +126,6 @@ def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
 def _slam(*arguments: str) -> list[str]:
     """``erfsfm-slam`` of this interpreter, whatever the working directory holds."""
     return [sys.executable, "-P", "-m", "slam", *arguments]
-
-
-def fingerprint(weights: str) -> str:
-    """Hash of sources and weights; jobs with another hash are run again."""
-    digest = hashlib.sha256()
-    for root in (*(ROOT / name for name in SOURCES), Path(weights)):
-        for path in sorted(root.rglob("*")):
-            if path.is_file() and "__pycache__" not in path.parts:
-                digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
 
 
 def revision(checkout: Path = ROOT) -> str:

@@ -18,8 +18,10 @@ _MOST_BYTES = 2**28  # 16 million points of four numbers
 def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.float64]:
     """The points of a file of float32 ``(P, 3)``, metres, in the LiDAR frame; x, y, z are the first of ``columns``.
 
+    Points at the LiDAR's own place or beyond 10 km, which it cannot measure, are left out.
+
     Raises:
-        DataError: it cannot be read, is cut off, or has none of the points of `measured_points`.
+        DataError: it cannot be read, is cut off, or has no other points.
     """
     try:
         content = read_bytes(path, _MOST_BYTES)
@@ -28,15 +30,7 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
     values = np.frombuffer(content[: len(content) // 4 * 4], dtype=np.float32)
     if len(values) == 0 or len(values) % columns:
         raise DataError(f"{path} is no Velodyne scan: wanted {columns} float32 a point; got {len(content)} bytes")
-    return measured_points(values.reshape(-1, columns)[:, :3].astype(np.float64), path)
-
-
-def measured_points(points: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-    """The points of a file ``(P, 3)`` that a LiDAR can measure: not its own place, and within 10 km.
-
-    Raises:
-        DataError: there are none.
-    """
+    points = values.reshape(-1, columns)[:, :3].astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.linalg.norm(points, axis=1)
     measured = (distances > 0) & (distances < _FARTHEST_M)

@@ -19,8 +19,8 @@ verbs = typer.Typer()
 
 @verbs.command()
 def batch(
-    drives: Annotated[Path, typer.Argument(help="a manifest (YAML or CSV), or a data set")],
-    output: Annotated[Path, typer.Option(help="holds a run folder for each drive, drives.csv and index.html")],
+    drives: Annotated[Path, typer.Argument(help="a manifest (CSV), or a data set")],
+    output: Annotated[Path, typer.Option(help="holds a run folder for each drive, and drives.csv")],
     sequence: Annotated[
         list[str] | None, typer.Option("--sequence", "-s", help="sequence of the data set; repeat")
     ] = None,
@@ -39,12 +39,12 @@ def batch(
 ) -> None:
     """Many drives at once, each in a process of its own. Started again, it runs what is not whole.
 
-    Example: erfsfm-slam batch drives.yaml --workers 4 --output drives
+    Example: erfsfm-slam batch drives.csv --workers 4 --output drives
     """
     from slam.commands.batch.cluster import workers as dask_workers
     from slam.commands.batch.execution import Limits, run_drives
     from slam.commands.batch.manifest import drives_of, require_known
-    from slam.commands.batch.summary import CSV, PAGE, check_output, summary_table, write_summary
+    from slam.commands.batch.summary import CSV, check_output, summary_table, write_summary
 
     if memory and not Path("/proc/self/statm").exists():
         raise SlamError("--memory needs Linux: leave it out here")
@@ -67,7 +67,7 @@ def batch(
     print_table(summary_table(outcomes))
     kept = sum(outcome.status == "kept" for outcome in outcomes)
     failed = sum(outcome.status == "failed" for outcome in outcomes)
-    typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {failed} failed: {output / PAGE}, {output / CSV}")
+    typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {failed} failed: {output / CSV}")
     if failed:
         first = next(outcome for outcome in outcomes if outcome.status == "failed")
         rest = "; the others are whole" if failed < len(outcomes) else ""

@@ -1,4 +1,4 @@
-"""The drives of a batch: from a manifest, YAML or CSV, or all sequences of a data set."""
+"""The drives of a batch: from a manifest in CSV, or all sequences of a data set."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.frame_range import EVERYTHING
-from erfsfm.common.yaml_file import read_yaml
 from erfsfm.inference import record_of_whole_weights
 from slam.config.sections import load_config
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import sequence_names
 from slam.sequences.excerpt import frame_range
 
-MANIFESTS = (".yaml", ".yml", ".csv")
+MANIFEST = ".csv"
 _KEYS = ("name", "dataset", "sequence", "camera", "options")
 _OURS = ("--dataset", "--sequence", "-s", "--camera", "--output", "--continue", "--json")
 
@@ -42,22 +39,22 @@ def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequenc
     """The drives of a manifest, or the named sequences of a data set.
 
     Args:
-        manifest_or_root: a ``.yaml`` or ``.csv`` file, or a data set.
+        manifest_or_root: a ``.csv`` file, or a data set.
         sequences: names in the data set; ``all`` is every one.
         options: of ``run``, for all drives; those of a manifest come after them.
 
     Raises:
         SequenceError: no such file or sequences, or an entry that is not understood.
     """
-    if manifest_or_root.suffix.lower() in MANIFESTS and manifest_or_root.is_file():
+    if manifest_or_root.suffix.lower() == MANIFEST and manifest_or_root.is_file():
         if list(sequences) != ["all"]:
             raise SequenceError(f"{manifest_or_root} names its sequences itself: leave out --sequence")
         return _manifest(manifest_or_root, options)
-    if manifest_or_root.suffix.lower() in MANIFESTS and not manifest_or_root.exists():
+    if manifest_or_root.suffix.lower() == MANIFEST and not manifest_or_root.exists():
         raise SequenceError(f"no manifest {manifest_or_root}: check the path")
     known = sequence_names(manifest_or_root)
     if not known:
-        raise SequenceError(f"{manifest_or_root} is no manifest ({', '.join(MANIFESTS)}) and holds no sequences")
+        raise SequenceError(f"{manifest_or_root} is no manifest ({MANIFEST}) and holds no sequences")
     missing = [name for name in sequences if name != "all" and name not in known]
     if missing:
         raise SequenceError(f"{manifest_or_root} has no sequence {missing[0]}: it has {', '.join(known)}")
@@ -72,42 +69,33 @@ def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequenc
 
 def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
     try:
-        rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _yaml_rows(path)
-    except (ErfsfmError, OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = _rows(path)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SequenceError(f"the manifest {path} cannot be read: {getattr(error, 'strerror', error)}") from error
     if not rows:
-        raise SequenceError(f"{path} names no drive: give a list of {', '.join(_KEYS)}")
+        raise SequenceError(f"{path} names no drive: give rows of {', '.join(_KEYS)}")
     return _named(
         [
-            (str(row.get("name") or ""), _drive(row, path, f"{path}, drive {number}", options))
+            (row.get("name", ""), _drive(row, path, f"{path}, drive {number}", options))
             for number, row in enumerate(rows, start=1)
         ],
         path,
     )
 
 
-def _csv_rows(path: Path) -> list[dict[str, Any]]:
+def _rows(path: Path) -> list[dict[str, str]]:
     lines = io.StringIO(read_text(path), newline="")
     return [{key: word for key, word in row.items() if word} for row in csv.DictReader(lines, skipinitialspace=True)]
 
 
-def _yaml_rows(path: Path) -> list[dict[str, Any]]:
-    content = read_yaml(path)
-    rows = content.get("drives") if isinstance(content, dict) else content
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise SequenceError(f"{path} must hold a list of drives, each with {', '.join(_KEYS)}")
-    return rows
-
-
-def _drive(row: dict[str, Any], path: Path, where: str, options: Sequence[str]) -> Drive:
+def _drive(row: dict[str, str], path: Path, where: str, options: Sequence[str]) -> Drive:
     unknown = [str(key) for key in row if key not in _KEYS]
-    if unknown or not isinstance(row.get("dataset"), str):
+    if unknown or "dataset" not in row:
         problem = f"{unknown[0]!r} is no key" if unknown else "dataset is missing"
         raise SequenceError(f"{where}: {problem}; the keys are {', '.join(_KEYS)}")
-    words = row.get("options") or []
     try:
-        own = shlex.split(words) if isinstance(words, str) else [str(word) for word in words]
-    except (TypeError, ValueError) as error:
+        own = shlex.split(row.get("options", ""))
+    except ValueError as error:
         raise SequenceError(
             f"{where}: options are not understood ({error}): write them as on a command line"
         ) from error
@@ -116,8 +104,8 @@ def _drive(row: dict[str, Any], path: Path, where: str, options: Sequence[str]) 
         raise SequenceError(
             f"{where}: {taken[0]} is no option of a drive: use the keys, the folder is given by the batch"
         )
-    named = [word for key in ("dataset", "sequence", "camera") if key in row for word in (f"--{key}", str(row[key]))]
-    name = str(row.get("name") or row.get("sequence") or Path(row["dataset"]).stem)
+    named = [word for key in ("dataset", "sequence", "camera") if key in row for word in (f"--{key}", row[key])]
+    name = row.get("name") or row.get("sequence") or Path(row["dataset"]).stem
     return Drive(name, path.absolute().parent, (*named, *options, *own))
 
 

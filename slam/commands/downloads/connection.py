@@ -65,12 +65,6 @@ class Connection:
         self._identity = identity
         return response
 
-    @property
-    def identity(self) -> Identity:
-        """Of the file, after a first request."""
-        assert self._identity is not None
-        return self._identity
-
 
 @contextmanager
 def connection_errors(url: str, what: str) -> Iterator[None]:

@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from erfsfm.common.progress import Progress
 from slam.commands.exports.images import interpolated, is_recorded, write_images
-from slam.commands.exports.options import ExportOptions
 from slam.formats.colmap import Sightings, write_colmap
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
@@ -32,7 +31,8 @@ def write_model(
     trajectory: Trajectory,
     R_up_world: FloatArray,
     cloud: Ply | None,
-    options: ExportOptions,
+    dataset: Path | None,
+    at_most: int | None,
     progress: Progress,
 ) -> None:
     """Write ``images/`` and, last, the model.
@@ -43,7 +43,8 @@ def write_model(
         trajectory: optimised, in the axes of the model.
         R_up_world: ``(3, 3)`` from the axes of the run to these.
         cloud: of the map, in these axes.
-        options: ``crop``, ``points`` and ``dataset`` count.
+        dataset: where the images are now; None where the run found them.
+        at_most: so many points; None for all.
         progress: called with (stage, done, total).
 
     Raises:
@@ -51,27 +52,27 @@ def write_model(
     """
     places = Places.read(folder.require(PLACES))
     without = interpolated(folder)
-    if options.dataset is None and not is_recorded(folder):
+    if dataset is None and not is_recorded(folder):
         logger.warning("%s does not record where its images are: the model has none; give --dataset", folder.path)
     else:
-        _, written = write_images(folder, output, trajectory, options.dataset, progress)
+        _, written = write_images(folder, output, trajectory, dataset, progress)
         without = set(range(len(trajectory))) - set(written)
-    points, sightings = _tracked(places, options)
+    points, sightings = _tracked(places, at_most)
     points = points @ R_up_world.T
     colours = np.full((len(points), 3), _GREY, np.uint8)
     if cloud is not None:
         if len(points):
             colours = cloud.colours_or_grey[cKDTree(cloud.points).query(points)[1]]
         rows = np.arange(len(cloud.points))
-        if options.points is not None:
-            left = max(options.points - len(points), 0)
+        if at_most is not None:
+            left = max(at_most - len(points), 0)
             rows = np.linspace(0, len(rows) - 1, min(left, len(rows))).round().astype(np.intp)
         points = np.concatenate([points, cloud.points[rows]])
         colours = np.concatenate([colours, cloud.colours_or_grey[rows]])
     write_colmap(output, places.intrinsics, trajectory.T_world_camera, points, colours, sightings, without)
 
 
-def _tracked(places: Places, options: ExportOptions) -> tuple[FloatArray, Sightings]:
+def _tracked(places: Places, at_most: int | None) -> tuple[FloatArray, Sightings]:
     """Points of corners ``(P, 3)`` in the axes of the run, at most as many as wanted, the longest tracks first."""
     if not places.views:
         return np.zeros((0, 3)), Sightings.none()
@@ -79,9 +80,7 @@ def _tracked(places: Places, options: ExportOptions) -> tuple[FloatArray, Sighti
     tracks = structure.tracks()
     length = np.bincount(tracks.point, minlength=len(tracks.points))
     wanted = np.isfinite(tracks.points).all(axis=1)
-    if options.crop is not None:
-        wanted &= options.crop.contains(np.nan_to_num(tracks.points))
-    chosen = np.argsort(np.where(wanted, -length, 1), kind="stable")[: int(wanted.sum())][: options.points]
+    chosen = np.argsort(np.where(wanted, -length, 1), kind="stable")[: int(wanted.sum())][:at_most]
     number = np.full(len(tracks.points), -1)
     number[chosen] = np.arange(len(chosen))
     kept = number[tracks.point] >= 0

@@ -9,17 +9,17 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.progress import Progress
-from slam.commands.exports.raster import write_png
 from slam.formats.trajectory import Trajectory, nearest_stamps
 from slam.frames import Intrinsics, Sequence
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import PLACES
-from slam.runtime.storage.files import remove
+from slam.runtime.storage.files import remove, write_atomically
 from slam.runtime.storage.record import Missing, known
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
@@ -62,7 +62,7 @@ def write_images(
             image = sequence.frame(row).image
         except (SlamError, ErfsfmError):
             continue
-        write_png(output / image_name(k), np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), np.uint8))
+        _write_png(output / image_name(k), image)
         written.append(k)
     if not written:
         raise RunError(f"no image of {folder.path} can be read: check the data set")
@@ -74,6 +74,13 @@ def write_images(
         if _IMAGE.fullmatch(path.name) and f"{FOLDER}/{path.name}" not in names:
             remove(path, RunError)
     return sequence.intrinsics, written
+
+
+def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    done, content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise RunError(f"{path}: cannot be encoded")
+    write_atomically(path, lambda partial: partial.write_bytes(content.tobytes()), RunError)
 
 
 def image_name(frame: int) -> str:

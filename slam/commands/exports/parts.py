@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from slam.commands.exports.nerfstudio import POINTS
-from slam.commands.exports.options import R_UP_WORLDS, ExportOptions
-from slam.commands.exports.raster import RASTER_FILES, is_own_raster
 from slam.formats.colmap import BINARY_FOLDER, MODEL_FILES, is_own_model
 from slam.formats.ros_map import describes_map
 from slam.formats.transforms import TRANSFORMS, is_own_scene
+from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
-from slam.results.output_file import check_replaced, check_replaced_trajectory
+from slam.results.output_file import check_replaced
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import CONFIG
 from slam.runtime.storage.record import known
 
-_MIN_TRIANGLES = 4
+# from a camera's x right, y down, z ahead
+R_UP_WORLDS: dict[str, FloatArray] = {
+    "y-down": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # x right, y ahead, z up
+}
 
 
 @dataclass(frozen=True)
@@ -36,38 +41,29 @@ class Part:
     """A part of a run.
 
     Attributes:
-        options: fields of `ExportOptions` that have an effect.
+        options: that have an effect.
         beginnings: of a file: the ends that its name may have, and how such a file begins.
         folder: of several files.
-        up: the only axes besides those of the run, where it cannot have all.
     """
 
     options: tuple[str, ...] = ()
     beginnings: Mapping[str, bytes] = field(default_factory=dict)
     folder: FolderPart | None = None
-    up: str = ""
 
 
 PARTS = {
-    "mesh": Part(("crop", "voxel", "triangles"), {".ply": b"ply", ".glb": b"glTF", ".gltf": b"{"}),
-    "cloud": Part(("crop", "voxel"), {".ply": b"ply", ".las": b"LASF", ".laz": b"LASF"}),
-    "trajectory": Part(),
-    "graph": Part((), {".g2o": b"VERTEX_SE3", ".txt": b"VERTEX_SE3"}, up="y-down"),
+    "mesh": Part((), {".ply": b"ply"}),
+    "cloud": Part((), {".ply": b"ply"}),
     "colmap": Part(
-        ("crop", "voxel", "dataset", "points"),
+        ("dataset", "points"),
         folder=FolderPart("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), is_own_model),
     ),
-    "nerfstudio": Part(
-        ("crop", "voxel", "dataset"), folder=FolderPart("a scene", ("images", POINTS, TRANSFORMS), is_own_scene)
-    ),
-    "raster": Part(
-        ("crop", "resolution", "origin"), folder=FolderPart("a raster", RASTER_FILES, is_own_raster), up="z"
-    ),
-    "occupancy": Part(("crop", "resolution"), {".yaml": b"", ".pgm": b"P5"}, up="z"),
+    "nerfstudio": Part(("dataset",), folder=FolderPart("a scene", ("images", POINTS, TRANSFORMS), is_own_scene)),
+    "occupancy": Part(("resolution",), {".yaml": b"", ".pgm": b"P5"}),
 }
 
 
-def check_options(what: str, up: str, options: ExportOptions) -> None:
+def check_options(what: str, up: str, resolution: float | None, dataset: Path | None, points: int | None) -> None:
     """Refuse what does not exist, has no effect or makes no sense.
 
     Raises:
@@ -76,22 +72,15 @@ def check_options(what: str, up: str, options: ExportOptions) -> None:
     if what not in PARTS:
         raise RunError(f"--what {what!r} is unknown: choose one of {', '.join(PARTS)}")
     if up not in R_UP_WORLDS:
-        raise RunError(f"--up {up!r} is unknown: choose {', '.join([*R_UP_WORLDS][:-1])} or {[*R_UP_WORLDS][-1]}")
-    for name in (each.name for each in fields(options)):
-        if getattr(options, name) is not None and name not in PARTS[what].options:
+        raise RunError(f"--up {up!r} is unknown: choose {' or '.join(R_UP_WORLDS)}")
+    for name, value in {"resolution": resolution, "dataset": dataset, "points": points}.items():
+        if value is not None and name not in PARTS[what].options:
             takers = ", ".join(taker for taker, part in PARTS.items() if name in part.options)
             raise RunError(f"--{name} does nothing for {what}: it is for {takers}")
-    for name in ("voxel", "resolution"):
-        value = getattr(options, name)
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise RunError(f"--{name} {value} must be a positive length")
-    if options.points is not None and options.points < 1:
-        raise RunError(f"--points {options.points} is too few: give 1 or more")
-    if options.triangles is not None and options.triangles < _MIN_TRIANGLES:
-        raise RunError(f"--triangles {options.triangles} is too few: give {_MIN_TRIANGLES} or more")
-    only = PARTS[what].up
-    if only and up not in ("y-down", only):
-        raise RunError(f"{what} has axes of its own: leave --up out or give --up {only}")
+    if resolution is not None and not (math.isfinite(resolution) and resolution > 0):
+        raise RunError(f"--resolution {resolution} must be a positive length")
+    if points is not None and points < 1:
+        raise RunError(f"--points {points} is too few: give 1 or more")
 
 
 def check_target(folder: RunFolder, what: str, output: Path) -> None:
@@ -101,7 +90,7 @@ def check_target(folder: RunFolder, what: str, output: Path) -> None:
         RunError: it is a folder where a file is wanted or the reverse, a file of a run or of the run's recording, or
             what would be replaced is something else.
     """
-    part, files = PARTS[what], [output]
+    part = PARTS[what]
     if part.folder is not None:
         if output.exists() and not output.is_dir():
             raise RunError(f"{output} is a file: {part.folder.noun} is several files, give the name of a folder")
@@ -109,18 +98,17 @@ def check_target(folder: RunFolder, what: str, output: Path) -> None:
         if others and not part.folder.is_own(output):
             raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
         return
-    if what == "trajectory":
-        check_replaced_trajectory(output)
-    else:
-        check_replaced(output, part.beginnings)
-    if what == "occupancy" and output.suffix.lower() in part.beginnings:
+    if output.suffix.lower() not in part.beginnings:
+        named = " or ".join(part.beginnings)
+        raise RunError(f"{what} is written as {named}; got '{output.name}', give a name that ends so")
+    files = [output]
+    if what == "occupancy":
         files = [output.with_suffix(suffix) for suffix in part.beginnings]
-        present = [path for path in files if path.exists() and path.stat().st_size]
+        present = [path for path in files if path.is_file() and path.stat().st_size]
         if present and not describes_map(files[0]):
             raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
-        for path in files:
-            check_replaced(path, part.beginnings)
     for path in files:
+        check_replaced(path, part.beginnings)
         if path.is_file() and _is_in_recording(folder, path):
             raise RunError(f"{path} belongs to the recording of the run: choose another --output")
 

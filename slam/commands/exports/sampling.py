@@ -44,7 +44,7 @@ class Grid:
         if width * height > _MAX_CELLS:
             raise RunError(
                 f"--resolution {resolution:g} gives {width:.0f} x {height:.0f} cells, more than {_MAX_CELLS:,}: "
-                "give a larger one, or --crop a part"
+                "give a larger one"
             )
         # the decimal nearest to the product, so that files say 12.3 and not 12.299999999999999
         x_min, y_max = float(low[0] * resolution), float(high[1] * resolution)
@@ -76,24 +76,22 @@ class Grid:
 
 @dataclass(frozen=True)
 class Samples:
-    """Points of a surface ``(S, 3)``, their colours ``(S, 3)`` from 0 to 255 and the area of each ``(S,)``."""
+    """Points of a surface ``(S, 3)`` and the area of each ``(S,)``."""
 
     points: FloatArray
-    colours: FloatArray
     areas: FloatArray
 
 
 def samples(mesh: Ply, grid: Grid) -> Iterator[Samples]:
     """The surface in equal parts of each triangle, so small that no cell is skipped."""
     assert mesh.triangles is not None
-    points, colours = mesh.points, mesh.colours_or_grey.astype(np.float64)
+    points = mesh.points
     for start in range(0, len(mesh.triangles), _CHUNK_SAMPLES):
-        chosen = mesh.triangles[start : start + _CHUNK_SAMPLES]
-        yield from _samples(points[chosen], colours[chosen], grid)
+        yield from _samples(points[mesh.triangles[start : start + _CHUNK_SAMPLES]], grid)
 
 
-def _samples(corners: FloatArray, colours: FloatArray, grid: Grid) -> Iterator[Samples]:
-    """Of triangles by the positions and colours of their corners ``(T, 3, 3)``."""
+def _samples(corners: FloatArray, grid: Grid) -> Iterator[Samples]:
+    """Of triangles by the positions of their corners ``(T, 3, 3)``."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.sqrt((edges**2).sum(axis=2)).max(axis=1)
     areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -106,7 +104,6 @@ def _samples(corners: FloatArray, colours: FloatArray, grid: Grid) -> Iterator[S
             chosen = triangles[start : start + step]
             yield Samples(
                 (weights @ corners[chosen]).reshape(-1, 3),
-                (weights @ colours[chosen]).reshape(-1, 3),
                 np.repeat(areas[chosen] / len(weights), len(weights)),
             )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import replace
-from typing import Annotated
+from functools import partial
 
 import typer
 
@@ -17,17 +17,14 @@ verbs = typer.Typer()
 
 @verbs.command()
 @options_of(LiveRequest)
-def live(
-    request: LiveRequest,
-    publish: Annotated[str | None, typer.Option(help="also over ZeroMQ, e.g. tcp://127.0.0.1:5555 (extra)")] = None,
-) -> None:
+def live(request: LiveRequest) -> None:
     """Poses while frames arrive, one JSON line a frame. Ctrl-C, or the end of the stream, leaves a whole run folder.
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.messages import emitters
+    from slam.commands.live.messages import write_line
     from slam.commands.live.run import run_live
 
-    with emitters(sys.stdout, publish) as emit:
-        folder = run_live(replace(request, command=shlex.join(["erfsfm-slam", *sys.argv[1:]])), emit)
+    command = shlex.join(["erfsfm-slam", *sys.argv[1:]])
+    folder = run_live(replace(request, command=command), partial(write_line, sys.stdout))
     typer.echo(f"everything in {folder.path}", err=True)

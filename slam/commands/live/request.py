@@ -19,9 +19,9 @@ class LiveRequest:
     camera: Annotated[
         str | None, typer.Option(help="the calibration, as in run; without --dataset the source itself")
     ] = None
-    dataset: Annotated[
-        str | None, typer.Option(help="number of a camera, address of a stream, pipe, video, or folder")
-    ] = None
+    dataset: Annotated[str | None, typer.Option(help="number of a camera, address of a stream, video, or folder")] = (
+        None
+    )
     calibration: Annotated[
         Path | None, typer.Option(help="camera.yaml or fov=DEGREES; default: beside the folder or video")
     ] = None

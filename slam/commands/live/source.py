@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.files import open_written
 from erfsfm.common.readers.images import IMAGE_SUFFIXES, first_size, is_image, natural_key, read_image
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, sequence_errors
@@ -123,20 +121,19 @@ class FolderSource:
 
 
 class VideoSource:
-    """A source that OpenCV opens: a camera's number, a stream's address, a pipe, or a file, played at its own speed."""
+    """A source that OpenCV opens: a camera's number, a stream's address, or a file, played at its own speed."""
 
-    def __init__(self, name: str, wait_s: float) -> None:
-        """Open it; wait up to ``wait_s`` for somebody who writes to a pipe.
+    def __init__(self, name: str) -> None:
+        """Open it.
 
         Raises:
             SequenceError: it cannot be opened or gives no image.
         """
         self._name = name
         self.is_stored = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
-        self._pipe = _opened(name, wait_s) if Path(name).is_fifo() else None
-        # by its descriptor: who wrote a short video is gone before OpenCV opens the pipe, and OpenCV waits for ever
-        source = name if self._pipe is None else f"pipe:{self._pipe.fileno()}"
-        self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(source)
+        if Path(name).is_fifo():  # OpenCV would wait for ever
+            raise SequenceError(f"{name} is a pipe: let the camera fill a folder, or give the address of its stream")
+        self._capture: Any = cv2.VideoCapture(int(name) if name.isdecimal() else name)
         self.fps = float(self.is_stored and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
         self._first = self._next()
         if self._first is None:
@@ -153,19 +150,10 @@ class VideoSource:
             yield stamp, image
             count, image = count + 1, self._next()
         self._capture.release()
-        if self._pipe is not None:
-            self._pipe.close()
 
     def _next(self) -> Image | None:
         read, image = self._capture.read()
         return np.ascontiguousarray(image[..., ::-1]) if read and image is not None else None
-
-
-def _opened(pipe: str, wait_s: float) -> BinaryIO:
-    try:
-        return os.fdopen(open_written(pipe, wait_s), "rb")
-    except OSError as error:
-        raise SequenceError(f"no image comes from {pipe}: it is {error.strerror}") from error
 
 
 def open_source(camera: str, wait_s: float) -> Source:
@@ -175,4 +163,4 @@ def open_source(camera: str, wait_s: float) -> Source:
         SequenceError: it cannot be opened, or no image comes within ``wait_s``.
     """
     folder = Path(camera)
-    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera, wait_s)
+    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera)

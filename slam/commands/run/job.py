@@ -30,7 +30,6 @@ from slam.pipeline.observer import Observer
 from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
-from slam.results.gps import write_places
 from slam.results.map_error import map_errors
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import write_map_views
@@ -174,7 +173,6 @@ def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
         folder.write_trajectory(name, getattr(result, name))
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
-    write_places(folder, result, job.recording.name)
     lidar = lidar_trajectory(result)
     if lidar is not None:
         folder.write_trajectory("lidar", lidar)

@@ -50,7 +50,6 @@ class RunRequest:
         None
     )
     output: Output = None
-    cache: Annotated[Path | None, typer.Option(help="folder that keeps network outputs for later runs")] = None
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")

@@ -118,11 +118,9 @@ def _resume(request: RunRequest, place: Path, before: Provenance) -> tuple[Job, 
 
 
 def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
-    """Open and check all inputs of a run; writes nothing but the cache's folder."""
+    """Open and check all inputs of a run; writes nothing."""
     if request.output is not None:
         check_output(request.output)
-        if request.cache is not None and request.cache.resolve() == request.output.resolve():
-            raise RunError(f"--cache and --output are one folder, {request.output}: choose another --cache")
     if request.rerun is not None:
         import_extra("rerun")
     settings = _settings(request, resumes)
@@ -147,7 +145,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
             f"{resumes or request.continues} was run with other weights or another depth source: continue it with the "
             "same --weights and depth.source"
         )
-    predictor = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
+    predictor = make_predictor(networks, source, settings.depth, recording.intrinsics)
     rest = checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
     pipeline = SlamPipeline(recording, predictor, settings, request.progress or silent, networks.noise, *rest)
     pipeline.require_possible()

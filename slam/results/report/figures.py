@@ -1,9 +1,8 @@
-"""Interactive figures of the report and of the page of a batch, by Plotly. A line without a colour has that of text."""
+"""Interactive figures of the report, by Plotly. A line without a colour has that of text."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
 from typing import Any
 
 import cv2
@@ -25,7 +24,6 @@ from slam.runtime.storage.record import known
 _DASHES = {REFERENCE: "dash", "odometry": "dashdot", "lidar": "dot"}
 _STRETCHES = 25  # of a path, over which lengths are compared
 _MAP, _PANEL = 560, 230  # heights, px
-_MOST_POINTS = 300  # of a drive among others
 
 
 def trajectories_figure(
@@ -64,28 +62,6 @@ def trajectories_figure(
         figure.update_xaxes(range=view.x, showgrid=False, zeroline=False)
         figure.update_yaxes(range=view.z, showgrid=False, zeroline=False)
     return _from_above(figure, unit)
-
-
-def drives_figure(drives: Mapping[str, Trajectory]) -> go.Figure:
-    """Trajectories of several drives from above, each from the origin and in its own unit."""
-    figure = go.Figure()
-    for k, (name, trajectory) in enumerate(drives.items()):
-        rows = np.linspace(0, len(trajectory) - 1, min(len(trajectory), _MOST_POINTS)).round().astype(np.int32)
-        x, _, z = trajectory.positions[rows].T
-        line = {"color": COLOURS[k % len(COLOURS)], "width": 1.8}
-        words = "frame %{customdata}: x %{x:.2f}, z %{y:.2f}"
-        look = {"mode": "lines", "name": escape(name), "line": line, "hovertemplate": words}
-        figure.add_trace(go.Scatter(x=_single(x), y=_single(z), customdata=rows, **look))
-    return _from_above(figure, "unit of the drive")
-
-
-def bars_figure(bars: Mapping[str, float], title: str) -> go.Figure:
-    """A bar for each name, the first on top."""
-    names = [escape(name) for name in bars]
-    bar = {"orientation": "h", "marker": {"color": COLOURS[0]}, "hovertemplate": "%{y}: %{x:.3g}<extra></extra>"}
-    figure = go.Figure(go.Bar(x=list(bars.values()), y=names, **bar))
-    figure.update_yaxes(autorange="reversed", type="category")
-    return figure.update_xaxes(title=title).update_layout(height=90 + 22 * len(bars))
 
 
 def error_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:

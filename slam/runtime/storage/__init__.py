@@ -1,1 +1,1 @@
-"""Storage on disk: atomic files, the cache, serialised sessions and spilled arrays."""
+"""Storage on disk: atomic files, serialised sessions and spilled arrays."""

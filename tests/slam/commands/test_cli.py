@@ -29,7 +29,7 @@ from slam.runtime.errors import SlamError
 Call = Callable[..., tuple[int, str, str]]
 MakeRun = Callable[..., RunFolder]
 
-VERBS = {"run", "evaluate", "export", "simulate", "plot", "localize", "config", "doctor"}
+VERBS = {"run", "evaluate", "export", "simulate", "localize", "config", "doctor"}
 QUICK = ("--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false")
 
 
@@ -152,9 +152,6 @@ def test_wrong_usage_exits_with_2(call: Call, arguments: list[str]) -> None:
         (["evaluate", "a.txt", "b.txt"], "a.txt: no such file"),
         (["evaluate", "."], "not a run folder"),
         (["export", "nowhere", "--what", "mesh", "--output", "m.ply"], "nowhere is not a run folder"),
-        (["export", "nowhere", "--what", "mesh", "--output", "m.ply", "--crop", "1,2"], "x0,x1,y0,y1,z0,z1"),
-        (["export", "nowhere", "--what", "raster", "--output", "r", "--origin", "north"], "LAT,LON,HEADING"),
-        (["plot", "nowhere"], "nowhere is not a run folder"),
         (["simulate", "world", "--route", "maze"], "maze"),
         (["simulate", "world", "--frames", "20"], "a loop closes within 250"),
         (["simulate", "world", "--hazards", "snow"], "snow"),
@@ -272,21 +269,17 @@ def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
 
 
 def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -> None:
-    """Files and runs in one table; several of one name as mean and deviation; frames, CSV, LaTeX and a plot."""
+    """Files and runs in one table; several of one name as mean and deviation; frames and CSV."""
     run = make_run("ours")
     for k in range(3):
         text = (run.path / "trajectory_optimised.kitti.txt").read_text().splitlines(keepends=True)
         Path(f"orb_{k}.txt").write_text("".join(text[: len(text) // 2 if k == 2 else None]))
     truth = run.path / "reference.kitti.txt"
     rows = len(truth.read_text().splitlines())
-    outputs = ("--csv", "a.csv", "--latex", "a.tex", "--plot", "a.png")
-    code, out, err = call("evaluate", run.path, "orb=orb_[01].txt", "--reference", truth, *outputs)
+    code, out, err = call("evaluate", run.path, "orb=orb_[01].txt", "--reference", truth, "--csv", "a.csv")
     assert (code, err) == (0, "") and "orb (2 runs)" in out and " ± 0.000" in out
     lines = Path("a.csv").read_text().splitlines()
     assert len(lines) == 4 and lines[0].startswith("system,path,poses,") and "align.6dof.t_rel_percent" in lines[0]
-    table = Path("a.tex").read_text()
-    assert table.startswith(r"\begin{tabular}{lr") and "orb (2 runs) & " in table
-    assert cv2.imread("a.png").std() > 5
     code, _, err = call("evaluate", "orb_2.txt", "--reference", truth)
     assert code == 1 and "orb_2.txt: the estimate has" in err and "--frames A:B" in err
     arguments = ("evaluate", run.path, "orb_2.txt", "--reference", run.path, "--frames", f"0:{rows // 2}")
@@ -303,24 +296,6 @@ def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -
     assert code == 1 and "choose another" in err
 
 
-def test_files_are_plotted_over_each_other(call: Call, make_run: MakeRun) -> None:
-    estimate, reference = files_of(make_run(), "kitti")
-    assert call("plot", estimate, reference, "--output", "plain.png")[0] == 0
-    code, _, err = call("plot", estimate, reference, "--what", "drift")
-    assert code == 1 and "need ground truth" in err
-    code, out, _ = call("plot", estimate, "--reference", reference, "--what", "trajectory,drift")
-    assert code == 0 and "plot.png" in out and cv2.imread("plot.png").std() > 5
-
-
-def test_plot(call: Call, make_run: MakeRun) -> None:
-    run = make_run().path
-    code, out, _ = call("plot", run, "--what", "trajectory, errors", "--output", "figure.png")
-    assert code == 0 and "figure.png" in out and cv2.imread("figure.png").std() > 5
-    for options, words in ((("--what", "speed"), "'speed' is unknown"), (("--output", "a.gif"), "got 'a.gif'")):
-        code, _, err = call("plot", run, *options)
-        assert code == 1 and err.count("\n") == 1 and words in err
-
-
 def test_the_printed_configuration_reads_back(call: Call) -> None:
     Path("mine.yaml").write_text(call("config")[1])
     assert load_config("mine.yaml") == load_config()
@@ -331,7 +306,6 @@ def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run:
     for words in (
         ("evaluate", *files_of(run)),
         ("export", run.path, "--what", "cloud", "--output", "map.ply"),
-        ("plot", run.path),
         ("simulate", "world", "--width", 104, "--height", 32, "--frames", 5, "--route", "straight"),
     ):
         assert call(*words, "--seed", 3, "--device", "cpu")[0] == 0
@@ -342,27 +316,12 @@ def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run:
     [
         ("mesh", "a/map.ply", "ply"),
         ("cloud", "map.ply", "ply"),
-        ("trajectory", "poses.txt", "1.0"),
-        ("trajectory", "poses.tum", "# timestamp"),
-        ("graph", "graph.g2o", "VERTEX_SE3:QUAT 0"),
-        ("mesh", "map.gltf", '{"asset"'),
     ],
 )
 def test_export(call: Call, make_run: MakeRun, what: str, output: str, start: str) -> None:
     run = make_run()
     code, out, _ = call("export", run.path, "--what", what, "--output", output)
     assert code == 0 and output in out and Path(output).read_bytes().startswith(start.encode())
-
-
-def test_export_of_a_part(call: Call, make_run: MakeRun) -> None:
-    """A box may begin with a minus."""
-    run = make_run()
-    box = ("--crop", "-1,2,-3,1,0,2")
-    assert call("export", run.path, "--what", "mesh", "--output", "a.glb", *box, "--voxel", 0.1)[0] == 0
-    code, _, err = call("export", run.path, "--what", "mesh", "--output", "b.glb", "--crop", "5,6,5,6,5,6")
-    assert code == 1 and err.count("\n") == 1 and "nothing of the map lies inside" in err
-    assert call("export", run.path, "--what", "raster", "--output", "raster", "--resolution", 0.5)[0] == 0
-    assert Path("raster/raster.yaml").is_file() and not Path("b.glb").exists()
 
 
 def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:

@@ -15,9 +15,9 @@ def test_default_file_is_the_defaults_complete_and_explained():
 
 
 def test_dump_reads_back(tmp_path):
-    config = load_config(None, ["pose_graph.max_loop_residual=1e-4", "gps.lever_arm_m=[1, 2, 0]", "scale.mode=none"])
+    config = load_config(None, ["pose_graph.max_loop_residual=1e-4", "gps.correlation_s=7", "scale.mode=none"])
     assert config.pose_graph.max_loop_residual == 1e-4
-    assert config.gps.lever_arm_m == (1, 2, 0)
+    assert config.gps.correlation_s == 7
     path = tmp_path / "mine.yaml"
     path.write_text(dump_yaml(config))
     assert load_config(path) == config

@@ -29,14 +29,12 @@ from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise, read_pose_noise, write_pose_noise
 from slam import run_slam
 from slam.config.sections import load_config
-from slam.formats.g2o import check_g2o
 from slam.formats.ply import coloured_ply, read_ply, write_ply
 from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.geometry import se3
 from slam.loops.places import Places
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.results.metrics import LoopsFile, Metrics
-from slam.runtime.storage.cache import DiskCache
 from slam.sequences.catalogue import open_sequence
 
 
@@ -105,13 +103,11 @@ READERS = (
     Reader("places.npz", "run/places.npz", Places.read),
     Reader("drive.zip", "run/drive.zip", SessionCheckpoint.read),
     Reader("keyframes.npz", "run/keyframes.npz", lambda path: SessionCheckpoint.open(path.parent)),
-    Reader("graph.g2o", "run/graph.g2o", check_g2o),
     Reader("PLY", "mesh.ply", read_ply, lambda ply: bool(np.isfinite(ply.points).all())),
     Reader("model.yaml", "weights/model.yaml", lambda path: load_model(path.parent)),
     Reader("safetensors", "weights/depth.safetensors", lambda path: load_model(path.parent)),
     Reader("noise.yaml", "weights/noise.yaml", lambda path: read_pose_noise(path.parent), _is_noise),
     Reader("checkpoint of SfMLearner", "old.pth.tar", read_old),
-    Reader("cache", "cache/ab/abcdef", lambda path: DiskCache(path.parents[1]).read("abcdef")),
 )
 
 
@@ -149,7 +145,6 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     known = {"frame": six, "turn": six, "length": six, "disagreement": six, "residual": six, "correlation": six}
     write_pose_noise(place / "weights", PoseNoise(**known, pose_sha256=sha256, measured_on=["simulated/1"], pairs=9))
     _write_old_checkpoint(place / "old.pth.tar")
-    DiskCache(place / "cache").write("abcdef", (np.arange(12.0).reshape(3, 4), np.zeros(2, np.uint8)))
     overrides = ["output.keep=keyframes", "output.report=false", "visual_odometry.enabled=false"]
     run_slam(kitti_root, "sim", weights=tiny_weights, output=place / "run", frames="0:8", overrides=overrides)
     return place
@@ -196,7 +191,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(
     damage_file(readable, reader.read, reader.sound)
 
 
-@pytest.mark.parametrize("reader", [r for r in READERS if r.name != "cache"], ids=lambda reader: reader.name)
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_a_folder_in_the_place_of_a_file_is_refused(
     reader: Reader, readable: Path, refuse_folder: Callable[..., None]
 ) -> None:

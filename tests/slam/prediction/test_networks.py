@@ -1,8 +1,7 @@
-"""The networks behind the ``Predictor`` protocol, and the cache of their answers."""
+"""The networks behind the ``Predictor`` protocol."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from erfsfm.inference import DepthPosePredictor, PreparedImage
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.prediction.networks import NetworkPredictor
-from slam.runtime.storage.cache import CacheNamespace, DiskCache
 
 CAMERA = Intrinsics(160, 48, 90.0, 90.0, 79.5, 23.5)
 
@@ -109,61 +107,3 @@ class Counting:
         T = np.tile(np.eye(4), (4, 1, 1))
         T[:, 0, 3] = [image.image.mean() for image in images[:4]]
         return T
-
-
-def cached(networks: Counting, folder: Path, identity: str = "weights") -> tuple[NetworkPredictor, CacheNamespace]:
-    """A predictor whose networks' answers are kept in a folder."""
-    namespace = CacheNamespace(DiskCache(folder), identity)
-    return NetworkPredictor(networks, CAMERA, answers=namespace.get_or_compute), namespace
-
-
-def entries(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.is_file())
-
-
-def test_a_second_run_reads_every_output_from_the_cache(tmp_path: Path) -> None:
-    networks, snippet = Counting(), frames(0)
-    first, namespace = cached(networks, tmp_path)
-    depth, poses = first.depth(snippet[2]), first.snippet(snippet)
-    assert (networks.asked, namespace.asked, namespace.found) == (2, 2, 0)
-    networks.prepared = 0
-    second, namespace = cached(networks, tmp_path)
-    copies = again(snippet)
-    np.testing.assert_array_equal(second.depth(copies[2]), depth)
-    found = second.snippet(copies)
-    np.testing.assert_array_equal(found.T_source_target, poses.T_source_target)
-    assert found.T_source_target.dtype == poses.T_source_target.dtype
-    assert found.residuals is not None
-    np.testing.assert_array_equal(found.residuals, poses.residuals)
-    assert (networks.asked, namespace.asked, namespace.found) == (2, 0, 2)
-    assert networks.prepared == 0, "images whose answers are known need not be prepared"
-
-
-def test_any_different_input_is_another_entry(tmp_path: Path) -> None:
-    networks, snippet = Counting(), frames(0)
-    predictor, _ = cached(networks, tmp_path)
-    predictor.depth(snippet[2])
-    predictor.snippet(snippet)
-    touched = snippet[0].image.copy()
-    touched[0, 0, 0] ^= 1
-    predictor.depth(Frame(0, 0.0, touched))
-    predictor.depth(Frame(0, 0.0, snippet[2].image.reshape(160, 48, 3)))
-    predictor.snippet([snippet[k] for k in (4, 3, 2, 1, 0)])
-    cached(networks, tmp_path, "other weights")[0].depth(again(snippet)[2])
-    assert networks.asked == len(entries(tmp_path)) == 6
-
-
-@pytest.mark.parametrize("damage", ["half", "empty", "flipped"])
-def test_a_broken_entry_is_computed_and_written_again(
-    tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    networks, (frame,) = Counting(), frames(0, 1)
-    expected = cached(networks, tmp_path)[0].depth(frame)
-    (path,) = entries(tmp_path)
-    whole = path.read_bytes()
-    flipped = whole[:-1] + bytes([whole[-1] ^ 1])
-    path.write_bytes({"half": whole[: len(whole) // 2], "empty": b"", "flipped": flipped}[damage])
-    with caplog.at_level(logging.WARNING):
-        np.testing.assert_array_equal(cached(networks, tmp_path)[0].depth(*again([frame])), expected)
-    assert networks.asked == 2 and "damaged" in caplog.text
-    assert entries(tmp_path) == [path] and path.read_bytes() == whole

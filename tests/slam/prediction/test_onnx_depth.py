@@ -14,7 +14,6 @@ from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.cache import CacheNamespace, DiskCache
 
 MakeNetwork = Callable[..., Path]
 PLAIN: dict[str, Any] = {"kind": "depth", "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
@@ -71,20 +70,3 @@ def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path:
     onnx.save(model, tmp_path / "split.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
     with pytest.raises(SlamError, match="weights in other files, which are not read: save it as one file"):
         opened(tmp_path / "split.onnx")
-
-
-def test_outputs_are_cached_by_file_and_settings(make_network: MakeNetwork, tmp_path: Path) -> None:
-    disk, frame = DiskCache(tmp_path / "cache"), Frame(0, 0.0, image(51))
-    first = opened(make_network())
-    for source, asked in (
-        (first, 1),
-        (opened(make_network()), 0),
-        (opened(make_network(), kind="disparity"), 1),
-        (opened(make_network(), std=(2.0, 2.0, 2.0)), 1),
-        (opened(make_network(gain=3.0)), 1),
-    ):
-        namespace = CacheNamespace(disk, source.identity)
-        source.use_cache(namespace.get_or_compute)
-        found = source.disparity(frame)
-        assert namespace.asked == asked and found.shape == (16, 32)
-    assert first.identity != opened(make_network(gain=3.0)).identity

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from slam.commands.exports.export import export
-from slam.commands.exports.options import Crop, ExportOptions
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame
 from slam.geometry.se3 import FloatArray, apply, invert
@@ -74,9 +73,7 @@ def test_corners_are_tracked_through_the_images(
 
 def test_points_are_chosen_by_the_length_of_their_tracks(run: RunFolder, tmp_path: Path) -> None:
     whole = [len(point) for point in rows(export(run, "colmap", tmp_path / "all") / "points3D.txt")]
-    few = rows(export(run, "colmap", tmp_path / "few", options=ExportOptions(points=20)) / "points3D.txt")
+    few = rows(export(run, "colmap", tmp_path / "few", "z", points=20) / "points3D.txt")
     assert [len(point) for point in few] == sorted(whole, reverse=True)[:20]
-    crop = Crop(np.array([-np.inf, -np.inf, 0.0]), np.array([0.0, np.inf, 30.0]))
-    inside = rows(export(run, "colmap", tmp_path / "crop", "z", ExportOptions(crop=crop)) / "points3D.txt")
-    X = np.array([point[1:4] for point in inside], float)
-    assert len(inside) > 10 and (X[:, 0] <= 0).all() and (X[:, 1] <= 30).all(), "y is ahead where z is up"
+    X = np.array([point[1:4] for point in few], float)
+    assert (X[:, 1] > 0).all(), "y is ahead where z is up"

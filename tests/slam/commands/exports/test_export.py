@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from slam.commands.exports.export import export
-from slam.commands.exports.options import R_UP_WORLDS
-from slam.formats.ply import read_ply
-from slam.formats.trajectory import read_trajectory
+from slam.commands.exports.parts import R_UP_WORLDS
+from slam.formats.ply import Ply, coloured_ply, read_ply, write_ply
 from slam.frames import Intrinsics
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
-from slam.runtime.errors import RunError, TrajectoryError
+from slam.runtime.errors import RunError
+from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import PLACES
 
 MakeRun = Callable[..., RunFolder]
@@ -36,7 +38,7 @@ def test_z_up_axes_are_a_rotation_with_the_sky_above_and_the_road_ahead() -> Non
 
 
 @pytest.mark.parametrize("what", ["mesh", "cloud"])
-def test_ply_is_copied_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
+def test_ply_is_written_as_it_is_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
     folder = make_run()
     source = folder.path / f"map_{what}.ply"
     copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down")
@@ -44,30 +46,6 @@ def test_ply_is_copied_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path:
     turned = export(folder, what, tmp_path / "new" / "b.ply", "z")
     np.testing.assert_allclose(read_ply(turned).points[2], [0, 1, 2])  # the vertex 2 m above the road, (0, -2, 1)
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.ply", "b.ply"]
-
-
-@pytest.mark.parametrize(("name", "format"), [("t.txt", "kitti"), ("t.tum", "tum"), ("t.tum.txt", "tum")])
-def test_trajectory_format_follows_the_name(make_run: MakeRun, tmp_path: Path, name: str, format: str) -> None:
-    folder = make_run()
-    written = export(folder, "trajectory", tmp_path / name, "y-down")
-    source = folder.path / f"trajectory_optimised.{format}.txt"
-    read, original = read_trajectory(written), read_trajectory(source)
-    np.testing.assert_allclose(read.T_world_camera, original.T_world_camera, atol=1e-6)
-    assert read.timed == (format == "tum")
-
-
-def test_trajectory_with_z_up_rotates_the_world_only(make_run: MakeRun, tmp_path: Path) -> None:
-    folder = make_run()
-    down = read_trajectory(export(folder, "trajectory", tmp_path / "a.tum", "y-down"))
-    up = read_trajectory(export(folder, "trajectory", tmp_path / "b.tum", "z"))
-    np.testing.assert_allclose(up.positions[:, 1], down.positions[:, 2], atol=1e-6)
-    np.testing.assert_allclose(up.T_world_camera[0, :3, :3], R_UP_WORLD, atol=1e-6)
-
-
-def test_graph_is_copied(make_run: MakeRun, tmp_path: Path) -> None:
-    folder = make_run()
-    written = export(folder, "graph", tmp_path / "g.g2o", "y-down")
-    assert written.read_bytes() == (folder.path / "graph.g2o").read_bytes()
 
 
 def keep_places(folder: RunFolder) -> None:
@@ -102,18 +80,13 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
     ("what", "name", "up", "why"),
     [
         ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
-        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap, nerfstudio"),
-        ("mesh", "out.stl", "y-down", r"written as \.ply, \.glb, \.gltf; got 'out\.stl'"),
-        ("cloud", "out.glb", "y-down", r"written as \.ply, \.las, \.laz"),
-        ("occupancy", "out.png", "z", r"ends in \.yaml"),
-        ("raster", "file", "z", "is a file: a raster is several files"),
+        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, colmap, nerfstudio, occupancy"),
+        ("mesh", "out.stl", "y-down", r"written as \.ply; got 'out\.stl'"),
+        ("occupancy", "out.png", "z", r"written as \.yaml or \.pgm"),
         ("nerfstudio", "file", "z", "is a file: a scene is several files"),
-        ("raster", "folder", "y-up", "leave --up out or give --up z"),
-        ("mesh", "out.ply", "x", "y-down, z or y-up"),
-        ("graph", "out.g2o", "z", "leave --up out"),
-        ("mesh", "", "y-down", "is a folder"),
-        ("graph", "file/out.g2o", "y-down", "cannot be written"),
-        ("trajectory", "file/out.tum", "y-down", r"target/file/out\.tum: cannot be written"),
+        ("mesh", "out.ply", "x", "y-down or z"),
+        ("mesh", "folder.ply", "y-down", "is a folder"),
+        ("cloud", "file/out.ply", "y-down", "cannot be written"),
     ],
 )
 def test_errors_are_clear_and_leave_nothing(
@@ -123,41 +96,33 @@ def test_errors_are_clear_and_leave_nothing(
     target = tmp_path / "target"
     target.mkdir()
     (target / "file").write_text("in the way")
-    with pytest.raises((RunError, TrajectoryError), match=why):
+    (target / "folder.ply").mkdir()
+    with pytest.raises(RunError, match=why):
         export(folder, what, target / name, up)
-    assert [path.name for path in target.iterdir()] == ["file"]
+    assert sorted(path.name for path in target.iterdir()) == ["file", "folder.ply"]
 
 
 @pytest.mark.parametrize(
     ("what", "name", "why"),
     [
-        ("trajectory", "run/trajectory_network.tum.txt", "is a file of a run"),
         ("mesh", "run/map_mesh.ply", "is a file of a run"),
-        ("trajectory", "camera.yaml", r"exists and does not end in \.txt or \.tum"),
-        ("graph", "camera.yaml", r"exists and does not end in \.g2o"),
         ("occupancy", "camera.yaml", "exists and is no map of ROS"),
         ("occupancy", "camera.pgm", "camera.yaml exists and is no map of ROS"),
         ("occupancy", "drive/photo.yaml", "photo.pgm exists and is no map of ROS"),
         ("mesh", "drive/thesis.ply", "thesis.ply exists and is a file of another kind"),
-        ("trajectory", "drive/images.txt", "images.txt exists and is a file of another kind"),
-        ("trajectory", "drive/truth.txt", "truth.txt belongs to the recording of the run"),
+        ("mesh", "drive/truth.ply", "truth.ply belongs to the recording of the run"),
         ("nerfstudio", "drive", "drive/images is none of ours"),
         ("colmap", "drive", "drive/images is none of ours"),
-        ("raster", "drive", "drive/height.png is none of ours"),
-        ("raster", "terrain", "terrain/raster.yaml is none of ours"),
     ],
 )
 def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, name: str, why: str) -> None:
     folder = make_run()
     (tmp_path / "drive/images").mkdir(parents=True)
-    for other in ("images.txt", "height.png"):
-        (tmp_path / "drive" / other).write_text("another program's")
+    (tmp_path / "drive/images.txt").write_text("another program's")
     (tmp_path / "camera.yaml").write_text("width: 40\n")
     (tmp_path / "drive/thesis.ply").write_text("my own")
     (tmp_path / "drive/photo.pgm").write_bytes(b"P5\n1 1\n255\n0")
-    (tmp_path / "terrain").mkdir()
-    (tmp_path / "terrain/raster.yaml").write_text("heights: my own\n")
-    shutil.copy(folder.path / "reference.kitti.txt", tmp_path / "drive/truth.txt")
+    shutil.copy(folder.path / "map_mesh.ply", tmp_path / "drive/truth.ply")
     metrics = folder.metrics().tree()
     metrics["provenance"]["recording"] = {"dataset": str(tmp_path / "drive")}
     folder.write_metrics(Metrics.model_validate(metrics))
@@ -172,9 +137,7 @@ def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, 
     ("what", "missing"),
     [
         ("mesh", "map_mesh.ply"),
-        ("trajectory", "trajectory_optimised.tum.txt"),
         ("colmap", "places.npz"),
-        ("raster", "map_mesh.ply"),
     ],
 )
 def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: str, missing: str) -> None:
@@ -199,19 +162,66 @@ def test_a_map_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Pa
     assert not (tmp_path / "out.ply").exists()
 
 
-@pytest.mark.parametrize("at", [-3, -20, 30])
-def test_a_graph_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Path, at: int) -> None:
+def test_an_estimate_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path: Path) -> None:
     folder = make_run()
-    cut(folder.path / "graph.g2o", at)
-    with pytest.raises(RunError, match=r"graph\.g2o is no pose graph"):
-        export(folder, "graph", tmp_path / "out.g2o", "y-down")
-    assert not (tmp_path / "out.g2o").exists()
-
-
-def test_a_trajectory_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path: Path) -> None:
-    folder = make_run()
+    keep_places(folder)
     path = folder.path / "trajectory_optimised.tum.txt"
     path.write_text("\n".join(path.read_text().splitlines()[:200]) + "\n")
     with pytest.raises(RunError, match=r"trajectory_optimised\.tum\.txt is damaged: it has 199 rows for 300 frames"):
-        export(folder, "trajectory", tmp_path / "out.txt", "y-down")
-    assert not (tmp_path / "out.txt").exists()
+        export(folder, "colmap", tmp_path / "out", "y-down")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("up", ["y-down", "z"])
+def test_open3d_reads_the_same_mesh(make_recorded: MakeRun, sheet: Ply, tmp_path: Path, up: str) -> None:
+    mesh = import_open3d().io.read_triangle_mesh(str(export(make_recorded(), "mesh", tmp_path / "new" / "M.PLY", up)))
+    np.testing.assert_allclose(np.asarray(mesh.vertices), sheet.points @ R_UP_WORLDS[up].T, atol=1e-12)
+    np.testing.assert_array_equal(np.asarray(mesh.triangles), sheet.triangles)
+    assert sheet.colours is not None
+    np.testing.assert_allclose(np.asarray(mesh.vertex_colors), sheet.colours / 255.0, atol=1 / 255)
+
+
+@pytest.mark.parametrize(
+    ("what", "options", "why"),
+    [
+        ("colmap", {"points": 0}, "--points 0 is too few"),
+        ("mesh", {"dataset": Path("x")}, "--dataset does nothing for mesh: it is for colmap, nerfstudio"),
+        ("occupancy", {"resolution": float("nan")}, "must be a positive length"),
+        ("occupancy", {"resolution": 1e-5}, "--resolution 1e-05 gives .* cells"),
+    ],
+)
+def test_options_without_sense_are_one_line_and_leave_nothing(
+    make_recorded: MakeRun, tmp_path: Path, what: str, options: dict[str, Any], why: str
+) -> None:
+    name = "model" if what == "colmap" else "map.yaml" if what == "occupancy" else "map.ply"
+    with pytest.raises(RunError, match=why) as caught:
+        export(make_recorded(), what, tmp_path / "new" / name, "y-down", **options)
+    assert "\n" not in str(caught.value) and not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "size"),
+    [("mesh", "m.ply", 2000), ("occupancy", "map.pgm", 100), ("nerfstudio", "scene/points.ply", 3000)],
+)
+def test_a_disk_that_is_full_is_one_line(
+    make_recorded: MakeRun, tmp_path: Path, what: str, name: str, size: int
+) -> None:
+    folder, output = make_recorded(), tmp_path / "new" / name
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with pytest.raises(RunError, match="cannot be written") as caught:
+            export(folder, what, output.parent if what == "nerfstudio" else output, "z")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "\n" not in str(caught.value) and not output.exists()
+    assert not [path.name for path in tmp_path.rglob(".*")]
+    assert not {"transforms.json", "map.yaml"} & {path.name for path in (tmp_path / "new").rglob("*")}
+
+
+def test_an_empty_map_is_not_exported(make_recorded: MakeRun, tmp_path: Path) -> None:
+    folder = make_recorded()
+    nothing = np.zeros((0, 3))
+    write_ply(folder.path / "map_mesh.ply", coloured_ply(nothing, nothing, nothing, np.zeros((0, 3), np.int64)))
+    with pytest.raises(RunError, match="the map is empty"):
+        export(folder, "mesh", tmp_path / "m.ply")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from slam.commands.exports.export import export
-from slam.commands.exports.options import R_UP_WORLDS, ExportOptions
-from slam.formats.ply import Ply, read_ply
+from slam.commands.exports.parts import R_UP_WORLDS
+from slam.formats.ply import Ply
 from slam.geometry.se3 import invert
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics, Provenance
@@ -180,9 +180,8 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     with pytest.raises(RunError, match=r"the images of .* are needed and not found .*; give --dataset ROOT") as caught:
         export(folder, "nerfstudio", tmp_path / "scene")
     assert "\n" not in str(caught.value) and not (tmp_path / "scene").exists()
-    moved = ExportOptions(dataset=tmp_path / "elsewhere", voxel=0.5)
-    written = export(folder, "nerfstudio", tmp_path / "scene", "z", moved)
-    assert len(scene(written)["frames"]) == 8 and len(read_ply(written / "points.ply").vertices) < 100
+    written = export(folder, "nerfstudio", tmp_path / "scene", "z", dataset=tmp_path / "elsewhere")
+    assert len(scene(written)["frames"]) == 8
 
 
 def test_a_run_that_does_not_say_where_its_images_are(make_recorded: MakeRecorded, tmp_path: Path) -> None:

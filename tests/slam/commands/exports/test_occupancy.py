@@ -14,7 +14,7 @@ from slam.commands.cli import app
 from slam.commands.exports.export import export
 from slam.commands.exports.ground import ground_along
 from slam.commands.exports.occupancy import occupancy_grid
-from slam.commands.exports.options import ExportOptions
+from slam.commands.exports.sampling import Grid, samples
 from slam.formats.ply import Ply, coloured_ply
 from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN, write_ros_map
 from slam.geometry import se3
@@ -134,6 +134,17 @@ def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None
         occupancy_grid(level((-3, 3), (0, 50), 5.0), poses, 0.2, True)
 
 
+def test_large_triangles_leave_no_holes_and_keep_their_area() -> None:
+    corners = np.array([[-5, 0, -1.5], [5, 0, -1.5], [5, 20, -1.5], [-5, 20, -1.5]], float)
+    floor = coloured_ply(corners, np.zeros((4, 3)), np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]]))
+    grid = Grid.around(floor.points, 0.07)
+    area, seen = 0.0, np.zeros(grid.width * grid.height, bool)
+    for part in samples(floor, grid):
+        area += part.areas.sum()
+        seen[grid.cells(part.points)] = True
+    assert area == pytest.approx(200) and seen.mean() > 0.985  # the border cells are cut by the edge
+
+
 def test_files_are_those_of_the_map_server(tmp_path: Path) -> None:
     cells = np.full((5, 4), UNKNOWN, np.uint8)
     cells[0, 3], cells[4, 0] = OCCUPIED, FREE
@@ -155,7 +166,7 @@ def test_files_are_those_of_the_map_server(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
 def test_the_grid_of_a_run(make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str) -> None:
-    written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", ExportOptions(resolution=0.2))
+    written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", resolution=0.2)
     assert sorted(path.name for path in written.parent.iterdir()) == ["map.pgm", "map.yaml"]
     assert written.name == "map.yaml" and yaml.safe_load(written.read_text())["origin"] == [0.0, 2.0, 0.0]
     cells = cv2.imread(str(tmp_path / "new" / "map.pgm"), cv2.IMREAD_UNCHANGED)

@@ -13,17 +13,15 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import CameraFile
-from slam.commands.localisation.accuracy import MapTruth, summary_line, true_poses
 from slam.commands.localisation.localiser import Localiser, image_numbers, localise
 from slam.commands.localisation.tables import localisation_json, localisation_table, write_localisations
 from slam.config.sections import LoopsConfig, dump_yaml, load_config
-from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti
+from slam.formats.trajectory import Trajectory, associate, read_trajectory, write_kitti
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
-from slam.results.metrics import ScaleMetrics
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import PLACES
 from slam.sequences.simulated import SimulatedSequence
@@ -209,42 +207,11 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     written = read_trajectory(tmp_path / "found.tum")
     np.testing.assert_array_equal(written.stamps, [0.0, 1.0, 2.0])
     np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
-
-
-def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    stamps = np.arange(60.0)
-    run.write_trajectory("reference", Trajectory(stamps, reference()))
-    scaled = reference().copy()
-    scaled[:, :3, 3] *= UNIT
-    run.write_trajectory("optimised", Trajectory(stamps, scaled))
-    run.write_metrics(run.metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0)))
-    rows = reference()[[10, 25, 40, 50, 50]]
-    rows[1, 0, 3] += 3.0  # a wrong truth
-    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), rows))
-    numbers = image_numbers(album, "0:4")
-    found = list(localise(album, run, numbers=numbers))
-    truth, known = MapTruth.of(run), true_poses(tmp_path / "truth.txt", album, numbers, reference())
-    errors = [truth.error(each, T_true) for each, T_true in zip(found, known, strict=True)]
-    whole = localisation_json(found, errors)
-    assert isinstance(whole, dict)
-    numbers_of = whole["summary"]
-    assert (numbers_of["images"], numbers_of["found"], numbers_of["success_rate"]) == (4, 3, 0.5)
-    assert numbers_of["median_error_m"] < 0.5 and numbers_of["median_error_deg"] < 1.0
-    assert numbers_of["median_world_error_m"] == pytest.approx(numbers_of["median_error_m"], abs=1e-6)
-    assert [entry["success"] for entry in whole["images"]] == [True, False, True, False]
-    assert whole["images"][1]["error_m"] == pytest.approx(3.0, abs=0.5) and whole["images"][3]["error_m"] is None
-    assert "50% of 4 images within 0.5 m and 2 deg" in summary_line(numbers_of)
-    assert len(localisation_table(found, errors).head) == 8
-
-
-def test_the_truth_of_a_run_that_began_later_is_in_its_world(album: Path, tmp_path: Path) -> None:
-    rows, T_any_world = reference()[:5], reference()[30]
-    for T_file_world in (np.eye(4), T_any_world):
-        write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), T_file_world @ rows))
-        of_run = Trajectory(np.arange(3.0), rows[1:4]).rebased().T_world_camera
-        known = true_poses(tmp_path / "truth.txt", album, range(4), of_run)
-        np.testing.assert_allclose(known[1:], of_run, atol=1e-6)
-        np.testing.assert_allclose(known[0], invert(rows[1]) @ rows[0], atol=1e-6)
+    write_localisations(tmp_path / "found.kitti", found, [10, 25, 40, 50, 60])
+    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(60.0), reference()))
+    pair = associate(read_trajectory(tmp_path / "found.kitti"), read_trajectory(tmp_path / "truth.txt"))
+    assert [len(each) for each in pair] == [3, 3]
+    np.testing.assert_allclose(pair[0].positions / UNIT, pair[1].positions, atol=0.5)
 
 
 def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
@@ -253,10 +220,7 @@ def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path:
     assert not (tmp_path / "found.tum").exists()
 
 
-def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(4.0), reference()[:4]))
-    with pytest.raises(RunError, match=r"has 4 poses and .* 5 images"):
-        true_poses(tmp_path / "truth.txt", album, range(5), reference())
+def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path) -> None:
     with pytest.raises(SequenceError, match="reaches outside"):
         image_numbers(album, "0:6")
     run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)

@@ -187,20 +187,6 @@ def test_live_sessions_take_a_network_and_refuse_folders(
         Slam.from_weights(tiny_weights, sequence.intrinsics, config)
 
 
-def test_a_cache_keeps_outputs_of_the_network(world: Path, exported: Path, tiny_weights: Path, tmp_path: Path) -> None:
-    from slam.prediction.onnx_depth import OnnxDepth
-
-    def forbidden(*_: object) -> None:
-        raise AssertionError("the network was run")
-
-    options = {"weights": tiny_weights, "frames": "0:7", "cache": tmp_path / "cache"}
-    cold = run(world, tmp_path / "cold", f"onnx:{exported}", **options)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OnnxDepth, "infer", forbidden)
-        warm = run(world, tmp_path / "warm", f"onnx:{exported}", **options)
-    np.testing.assert_array_equal(positions(cold), positions(warm))
-
-
 @pytest.mark.parametrize(
     ("source", "message"),
     [

@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.image import imread
-from numpy.typing import NDArray
 
 from slam.evaluation.drift import aligned, segment_drifts
 from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import Similarity, from_rotation_vector
 from slam.results.folder import RunFolder
-from slam.results.report.plots import (
-    draw_errors,
-    draw_trajectories,
-    plot_runs,
-    trajectories_of,
-)
-from slam.runtime.errors import RunError
+from slam.results.report.plots import draw_trajectories, trajectories_of
 
 MakeRun = Callable[..., RunFolder]
-
-
-def is_blank(picture: NDArray[np.floating]) -> bool:
-    return bool(picture[..., :3].std() < 0.02)
 
 
 def moved(trajectory: Trajectory, scale: float) -> Trajectory:
@@ -68,30 +54,3 @@ def test_drift_of_a_known_scale_and_rotation_has_its_hand_value() -> None:
     # a segment ends with the first frame beyond its length, KITTI's rule: 11 m for 10 m
     assert drifts[0].translation == pytest.approx(0.05 * 11 / 10)
     assert drifts[0].rotation == 0.0
-
-
-def test_errors_need_a_reference(make_run: MakeRun, tmp_path: Path) -> None:
-    run = make_run(reference=False)
-    with pytest.raises(RunError, match="no reference"):
-        draw_errors(Figure(), trajectories_of(run), "m")
-    with pytest.raises(RunError, match=r"has no reference.*plot --what trajectory"):
-        plot_runs([run], ["errors"], tmp_path / "a.png")
-    plot_runs([run], ["trajectory"], tmp_path / "a.png")
-    with pytest.raises(RunError, match="60 runs are wider than a page"):
-        plot_runs([run] * 60, ["trajectory"], tmp_path / "a.png")
-
-
-@pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("PDF", b"%PDF"), ("svg", b"<?xml")])
-def test_figures_are_written_in_every_format(make_run: MakeRun, tmp_path: Path, suffix: str, start: bytes) -> None:
-    output, before = tmp_path / "out" / f"figure.{suffix}", dict(mpl.rcParams)
-    plot_runs([make_run("one"), make_run("two")], ["trajectory", "errors", "drift"], output)
-    assert dict(mpl.rcParams) == before
-    content = output.read_bytes()
-    assert content.startswith(start)
-    assert b"CreationDate" not in content
-    assert b"dc:date" not in content
-    assert [path.name for path in output.parent.iterdir()] == [output.name]
-    if suffix == "png":
-        picture = imread(output)
-        assert picture.shape[1] > picture.shape[0]
-        assert not is_blank(picture)

@@ -1,4 +1,4 @@
-"""nuScenes and Argoverse 2: front cameras by the data sets' own tables, with true poses and LiDAR."""
+"""nuScenes: the front camera by the data set's own tables, with true poses and LiDAR."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.runtime import imports
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 
 HALF = 0.5  # the quaternion wxyz (0.5, -0.5, 0.5, -0.5) turns a car's axes to a camera's that looks ahead
 AHEAD = [HALF, -HALF, HALF, -HALF]
 FRAMES = 5
-FIRST_NS = 315966070_000_000_000
 
 
 @pytest.fixture
@@ -87,71 +85,3 @@ def test_damaged_tables(nuscenes: Path, name: str, text: str, message: str) -> N
     (nuscenes / "v1.0-mini" / f"{name}.json").write_text(text)
     with pytest.raises(SequenceError, match=message):
         open_sequence(nuscenes, "scene-0061")
-
-
-@pytest.fixture
-def log(tmp_path: Path, images) -> Path:
-    """A log whose car goes 1 m along x each 50 ms."""
-    pyarrow = pytest.importorskip("pyarrow")
-    from pyarrow import feather
-
-    root = tmp_path / "val/0b86f508"
-    stamps = [FIRST_NS + k * 50_000_000 for k in range(FRAMES)]
-    images(root / "sensors/cameras/ring_front_center", [f"{ns}.jpg" for ns in stamps])
-    (root / "calibration").mkdir()
-    (root / "sensors/lidar").mkdir()
-
-    def write(name: str, **columns: Any) -> None:
-        feather.write_feather(pyarrow.table(columns), root / name)
-
-    sensors = {"sensor_name": ["ring_rear_left", "ring_front_center"]}
-    size = {"width_px": [10, 40], "height_px": [10, 24], "k1": [0.0, -0.1]}
-    focal = {"fx_px": [1.0, 30.0], "fy_px": [1.0, 30.0], "cx_px": [5.0, 20.0], "cy_px": [5.0, 12.0]}
-    write("calibration/intrinsics.feather", **sensors, **focal, **size)
-    turned = {f"q{axis}": [1.0, value] for axis, value in zip("wxyz", AHEAD, strict=True)}
-    place = {"tx_m": [0.0, 1.6], "ty_m": [0.0, 0.0], "tz_m": [0.0, 1.4]}
-    write("calibration/egovehicle_SE3_sensor.feather", **sensors, **turned, **place)
-    straight = {"qw": [1.0] * 7, "qx": [0.0] * 7, "qy": [0.0] * 7, "qz": [0.0] * 7}
-    path = {"tx_m": [float(k) for k in range(-1, 6)], "ty_m": [9.0] * 7, "tz_m": [0.0] * 7}
-    write(
-        "city_SE3_egovehicle.feather",
-        timestamp_ns=[FIRST_NS + k * 50_000_000 for k in range(-1, 6)],
-        **straight,
-        **path,
-    )
-    sweep = {axis: np.array([value, value + 1], np.float16) for axis, value in zip("xyz", (1, 3, 5), strict=True)}
-    write(f"sensors/lidar/{FIRST_NS + 110_000_000}.feather", **sweep)
-    write(f"sensors/lidar/{FIRST_NS + 120_000_000}.feather", x=[0.0], y=[0.0], z=[0.0])  # farther from the image
-    return root
-
-
-def test_argoverse(log: Path) -> None:
-    assert sequence_kinds(log.parent) == {"0b86f508": "Argoverse 2"}
-    sequence = open_sequence(log)
-    assert (len(sequence), sequence.intrinsics.fx, sequence.camera_height_m) == (FRAMES, 30, None)
-    assert sequence.stamps[1] == (FIRST_NS + 50_000_000) / 10**9
-    assert sequence.reference is not None
-    assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(FRAMES), [0, 0, 1]), abs=1e-6)
-    assert [k for k in range(FRAMES) if sequence.has_scan(k)] == [2]
-    assert sequence.scan(2).tolist() == [[1, 3, 5], [2, 4, 6]]
-    # the car's origin is 1.6 m behind the camera and 1.4 m below it
-    assert sequence.T_camera_lidar is not None
-    assert sequence.T_camera_lidar[:3, 3] == pytest.approx([0, 1.4, -1.6])
-
-
-def test_argoverse_damaged_or_without_pyarrow(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    poses = log / "city_SE3_egovehicle.feather"
-    whole = poses.read_bytes()
-    poses.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(SequenceError, match=r"cannot read table .*city_SE3_egovehicle\.feather"):
-        open_sequence(log)
-    poses.write_bytes((log / "calibration/intrinsics.feather").read_bytes())
-    with pytest.raises(SequenceError, match="are not those of Argoverse 2: KeyError"):
-        open_sequence(log)
-
-    def absent(name: str) -> None:
-        raise ImportError(f"No module named {name}")
-
-    monkeypatch.setattr(imports.importlib, "import_module", absent)
-    with pytest.raises(SequenceError, match=r"needs pyarrow .*erfsfm-slam\[argoverse\]"):
-        open_sequence(log)

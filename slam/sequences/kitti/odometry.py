@@ -94,14 +94,16 @@ def _true_poses(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_c
     """Poses of the camera in use from poses of camera 0; None where the root has no poses."""
     if not path.exists():
         return None
-    T_world_cam0 = read_trajectory(path, format="kitti").T_world_camera
-    assigned = files.rows_of(len(T_world_cam0))
+    found = read_trajectory(path, format="kitti")
+    assigned = files.rows_of(found.frame_count)
     if assigned is None:
         raise SequenceError(
-            f"{path} has {len(T_world_cam0)} poses for {len(files.paths)} images: restore the missing images, or cut "
+            f"{path} has {found.frame_count} poses for {len(files.paths)} images: restore the missing images, or cut "
             f"the poses to match, or remove the file to run without a reference"
         )
     rows, skipped = assigned
+    T_world_cam0 = np.full((found.frame_count, 4, 4), np.nan)
+    T_world_cam0[found.frame_numbers] = found.T_world_camera
     T_world_camera = T_world_cam0[skipped:] @ se3.invert(T_camera_cam0)
     if len(rows) < len(files):
         T_world_camera = interpolated_poses(T_world_camera, stamps[rows], stamps)

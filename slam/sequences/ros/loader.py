@@ -15,6 +15,7 @@ import numpy as np
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import first_usual
+from slam.formats.rows import BadRows
 from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
@@ -192,10 +193,23 @@ def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatA
             logger.warning("%s is not used: no static transform from its %r to the camera's %r", topic, body, camera)
             continue
         found = StampedMessages(bag, topic)
-        messages = (found.read(k) for k in range(len(found)))
-        T_any_body = np.stack([transform_of(m.pose.pose if hasattr(m, "pose") else m.transform) for m in messages])
-        return poses_near(T_any_body @ T_body_camera, found.stamps, stamps, bag.path)
+        known, T_any_body = _poses(found)
+        return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
     return None
+
+
+def _poses(messages: StampedMessages) -> tuple[FloatArray, FloatArray]:
+    """Stamps ``(M,)`` and poses ``(M, 4, 4)`` of the good messages of a topic."""
+    bad, good, T_any_body = BadRows(f"topic {messages.topic}", SequenceError), [], []
+    for number in range(len(messages)):
+        message = messages.read(number)
+        try:
+            T_any_body.append(transform_of(message.pose.pose if hasattr(message, "pose") else message.transform))
+            good.append(number)
+        except ValueError as error:
+            bad.add(number, str(error))
+    bad.say(len(good), "a pose a message")
+    return messages.stamps[good], np.stack(T_any_body)
 
 
 def _scans(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from slam.geometry.se3 import FloatArray, invert
 from slam.sequences.poses import poses_of
 from slam.sequences.ros.bag import Bag
 
+logger = logging.getLogger(__name__)
+
 TOPIC = "/tf_static"
 
 
@@ -17,13 +20,16 @@ class StaticTransforms:
     """The tree of the frames of ``/tf_static``."""
 
     def __init__(self, bag: Bag) -> None:
-        """Read all static transforms; the last of a frame counts."""
-        messages = bag.messages(TOPIC) if TOPIC in bag.types else ()
-        self._parents = {
-            frame_name(each.child_frame_id): (frame_name(each.header.frame_id), transform_of(each.transform))
-            for message in messages
-            for each in message.transforms
-        }
+        """Read all static transforms, without bad ones; the last of a frame counts."""
+        self._parents: dict[str, tuple[str, FloatArray]] = {}
+        for message in bag.messages(TOPIC) if TOPIC in bag.types else ():
+            for each in message.transforms:
+                try:
+                    mount = frame_name(each.header.frame_id), transform_of(each.transform)
+                except ValueError as error:
+                    logger.warning("%s: the transform of %r is left out: %s", TOPIC, each.child_frame_id, error)
+                    continue
+                self._parents[frame_name(each.child_frame_id)] = mount
 
     def between(self, a: str, b: str) -> FloatArray | None:
         """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
@@ -49,7 +55,11 @@ def frame_name(text: str) -> str:
 
 
 def transform_of(message: Any) -> FloatArray:
-    """``T_parent_child`` ``(4, 4)`` of a ``Transform`` or a ``Pose``."""
+    """``T_parent_child`` ``(4, 4)`` of a ``Transform`` or a ``Pose``.
+
+    Raises:
+        ValueError: its rotation is none, or its position is not finite.
+    """
     t = message.translation if hasattr(message, "translation") else message.position
     q = message.rotation if hasattr(message, "rotation") else message.orientation
     T: FloatArray = poses_of(np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]]))[0]

@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import DataError
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.recording import RecordedSequence
@@ -58,17 +59,27 @@ def test_uncovered_images_mean_no_reference(folder: Path, caplog: pytest.LogCapt
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("# nothing\n", "names no images"),
-        ("100.0 rgb/100.02.png extra\n", "line 1 is not 'stamp file'"),
-        ("soon rgb/100.02.png\n", "line 1 is not 'stamp file'"),
-        ("100.0 rgb/gone.png\n", r"no image .*gone\.png"),
-        ("100.2 rgb/100.02.png\n100.1 rgb/100.05.png\n", "row 2: stamps must be numbers that increase"),
+        ("# nothing\n", "there is no row"),
+        ("100.0 rgb/100.02.png extra\n", "line 1: .*is not 'stamp file'"),
+        ("soon rgb/100.02.png\n", "line 1: .*is not 'stamp file'"),
+        ("100.0 rgb/gone.png\n", "none of the 1 images"),
+        ("100.2 rgb/100.02.png\n100.1 rgb/100.05.png\n", "line 1: stamps must increase"),
     ],
 )
 def test_malformed_index(folder: Path, text: str, message: str) -> None:
     (folder / "rgb.txt").write_text(text)
-    with pytest.raises(SequenceError, match=message):
+    with pytest.raises((SequenceError, DataError), match=message):
         open_sequence(folder, None, None, None)
+
+
+def test_bad_rows_are_left_out(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    known = open_sequence(folder)
+    index = folder / "rgb.txt"
+    rows = index.read_text().splitlines()
+    index.write_text("\n".join([*rows, rows[-1], "soon rgb/100.02.png"]))
+    again = open_sequence(folder)
+    np.testing.assert_array_equal(again.stamps, known.stamps)
+    assert len(again) == len(known) and "2 of " in caplog.text
 
 
 def test_needs_a_camera_file(folder: Path) -> None:

@@ -56,8 +56,8 @@ def test_damage(walk: Path) -> None:
     with pytest.raises(SequenceError, match=r"camera\.txt needs a row of fx fy cx cy"):
         open_sequence(walk)
     (walk / "camera.txt").write_text(f"{LENS}\n40 24\n")
-    (walk / "times.txt").write_text("00000 soon\n")
-    with pytest.raises(SequenceError, match=r"times\.txt needs rows of number, seconds"):
+    (walk / "times.txt").write_text("00000 soon\n" * 6)
+    with pytest.raises(SequenceError, match=r"times\.txt, line 1"):
         open_sequence(walk)
     for path in (walk / "images").iterdir():
         path.unlink()

@@ -146,6 +146,7 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
     half = 0.5
     bag.mount("body", "camera", bag.transform((0.1, 0, 0), (-half, half, -half, half)))
     bag.mount("camera", "lidar", bag.transform((0, -2, 0)))
+    bag.mount("body", "broken", bag.transform((0, 0, 0), (0, 0, 0, 0)))  # it is left out
     for k in range(-1, FRAMES + 1):
         transform = bag.transform((k, 5, 0))
         bag.write(
@@ -156,6 +157,8 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
     fields = [
         bag.make("sensor_msgs/msg/PointField", name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")
     ]
+    lost = bag.stamped_transform(FIRST_NS + 1, "w", "body", bag.transform((9, 9, 9), (0, 0, 0, 0)))
+    bag.write("/ground_truth", FIRST_NS + 1, lost)
     points = np.array([[1, 2, 3, 0], [np.nan, 0, 0, 0], [4, 5, 6, 0]], np.float32)
     for late_ns, shift in ((9_000_000, 0), (24_000_000, 7)):  # the second is farther from the image
         cloud = bag.make(

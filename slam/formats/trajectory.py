@@ -32,6 +32,8 @@ _T_TARTAN_CAMERA = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0,
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST = 1e12  # metres: to Saturn
+_SAME_STAMP = 0.05  # of the period: stamps of one image differ by less
+_LONE_PERIOD_S = 0.04  # of a trajectory of one pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +95,10 @@ class Trajectory:
         """The same motion with the first camera as the world: the first pose is the identity."""
         T_first_world = se3.invert(self.T_world_camera[0])
         return replace(self, T_world_camera=T_first_world @ self.T_world_camera)
+
+    def at(self, stamps: FloatArray) -> Trajectory:
+        """Interpolated poses of a timed trajectory at stamps ``(M,)``; its ends are held."""
+        return Trajectory(stamps, se3.interpolate(self.T_world_camera, self.stamps, stamps))
 
     def select(self, rows: NDArray[np.intp]) -> Trajectory:
         """The poses of some rows, in the order given."""
@@ -175,8 +181,9 @@ def associate(
 ) -> tuple[Trajectory, Trajectory]:
     """The rows of both that belong to the same frames, equally many.
 
-    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. Otherwise rows are
-    matched by their frame numbers where one of the two has them, and else row k belongs to row k.
+    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`; where these stamps
+    differ, the denser trajectory is interpolated at those of the other. Otherwise rows are matched by their frame
+    numbers where one of the two has them, and else row k belongs to row k.
 
     Args:
         estimate: to be compared.
@@ -204,7 +211,13 @@ def associate(
     expected = min(len(estimate), len(reference))
     if rows_estimate.size < 0.9 * expected:
         logger.warning("only %d of %d poses have a matching time stamp", rows_estimate.size, expected)
-    return estimate.select(rows_estimate), reference.select(rows_reference)
+    pair = estimate.select(rows_estimate), reference.select(rows_reference)
+    apart = np.abs(pair[0].stamps - pair[1].stamps).max()
+    if apart <= _SAME_STAMP * min(_period_s(estimate), _period_s(reference)):
+        return pair
+    if _period_s(estimate) < _period_s(reference):
+        return estimate.at(pair[1].stamps), pair[1]
+    return pair[0], reference.at(pair[0].stamps)
 
 
 def _of_frames(trajectory: Trajectory, start: int, stop: int) -> Trajectory:
@@ -236,8 +249,11 @@ def _same_frames(estimate: Trajectory, reference: Trajectory) -> tuple[Trajector
 
 def matching_tolerance_s(estimate: Trajectory, reference: Trajectory) -> float:
     """Largest time difference of a matching pair: half the frame period (median) of the denser one."""
-    periods = [float(np.median(np.diff(each.stamps))) for each in (estimate, reference) if len(each) > 1]
-    return 0.5 * min(periods, default=0.02)
+    return 0.5 * min(_period_s(estimate), _period_s(reference))
+
+
+def _period_s(trajectory: Trajectory) -> float:
+    return float(np.median(np.diff(trajectory.stamps))) if len(trajectory) > 1 else _LONE_PERIOD_S
 
 
 def nearest_pairs(a: FloatArray, b: FloatArray, within_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
 from slam.results.error_columns import COLUMNS, DASH, ErrorColumn, missing_by_reason, written
@@ -24,6 +26,8 @@ from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import Missing
 from slam.runtime.terminal import TerminalTable
 from slam.sequences.excerpt import frame_range
+
+logger = logging.getLogger(__name__)
 
 _COLUMNS = COLUMNS[:-1]  # without the difference to evo
 _SPECIAL = str.maketrans({c: f"\\{c}" for c in "_%&#$"} | {"±": "$\\pm$", DASH: "--"})
@@ -106,6 +110,8 @@ def compare(
             pair = associate(estimate, truth, chosen)
         except TrajectoryError as error:
             raise TrajectoryError(f"{path}: {error}") from error
+        for line in likely_mistakes(estimate, truth, pair):
+            logger.warning("%s: %s", path, line)
         runs.append(SystemRun(name, path, *pair, trajectory_metrics(*pair)))
     return runs
 

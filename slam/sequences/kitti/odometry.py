@@ -25,7 +25,6 @@ from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
     RecordedSequence,
     Source,
@@ -106,7 +105,7 @@ def _true_poses(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_c
     T_world_cam0[found.frame_numbers] = found.T_world_camera
     T_world_camera = T_world_cam0[skipped:] @ se3.invert(T_camera_cam0)
     if len(rows) < len(files):
-        T_world_camera = interpolated_poses(T_world_camera, stamps[rows], stamps)
+        T_world_camera = se3.interpolate(T_world_camera, stamps[rows], stamps)
     return T_world_camera
 
 

@@ -30,7 +30,6 @@ from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti import oxts
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
     RecordedSequence,
     Source,
@@ -148,7 +147,7 @@ def _true_poses(
     T_camera_imu = T_camera_lidar @ CalibrationFile(path).transform("R", "T")
     T_world_camera = oxts.T_world_imu(content, ages_s) @ se3.invert(T_camera_imu)
     if len(known) < len(files):
-        T_world_camera = interpolated_poses(T_world_camera, stamps[known], stamps)
+        T_world_camera = se3.interpolate(T_world_camera, stamps[known], stamps)
     return T_world_camera
 
 

@@ -21,7 +21,7 @@ from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, explicit_camera
+from slam.sequences.camera_file import explicit_camera, mount_beside
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
@@ -55,10 +55,10 @@ def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Re
     simulated = root.simulation_seed()
     camera: CameraFile | Intrinsics
     if asked is None:
-        found, height_m = beside(root.base), CAMERA_HEIGHT_M if simulated is None else None
-        camera = Intrinsics.of(calibration.pinhole(f"P{number}", stored.width, stored.height))
-        if found is not None:
-            camera, height_m = replace(camera, readout_s=found.readout_ms / 1e3), found.height_or(height_m)
+        pinhole = calibration.pinhole(f"P{number}", stored.width, stored.height)
+        usual_m = CAMERA_HEIGHT_M if simulated is None else None
+        height_m, readout_s = mount_beside(pinhole, usual_m, root.base)
+        camera = replace(Intrinsics.of(pinhole), readout_s=readout_s)
     else:
         camera, height_m = explicit_camera(asked, stored), CAMERA_HEIGHT_M
     return RecordedSequence(

@@ -33,6 +33,7 @@ from slam.sequences.ros.messages import (
     camera_file_of,
     image_of,
     is_colour,
+    is_rectified,
     points_of,
 )
 from slam.sequences.ros.transforms import StaticTransforms, transform_of
@@ -42,6 +43,7 @@ logger = logging.getLogger(__name__)
 _ODOMETRY, _TRANSFORM = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"
 _TRUTH = re.compile(r"ground_?truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack", re.IGNORECASE)
 _CACHED_FRAMES = 32
+_MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
 _SKIPPED_FRAMES = 30
 _SCAN_DELAY_S = 0.05
@@ -51,8 +53,8 @@ _NANOSECONDS = 10**9
 class StampedMessages:
     """The messages of a topic whose first field is a header, in the order of their stamps, read one at a time.
 
-    All messages are read once for their stamps. Where no header has a stamp, the times of recording are used; of
-    messages with one stamp the first is kept.
+    All messages are read once for their stamps. Where no header has a stamp, or their clock was set back, the times of
+    recording are used; of messages with one stamp the first is kept.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
@@ -68,6 +70,15 @@ class StampedMessages:
         self._times_ns = [time_ns for time_ns, _ in pairs]
         stamps_ns = [stamp_ns for _, stamp_ns in pairs] if any(stamp for _, stamp in pairs) else self._times_ns
         numbers = sorted(range(len(pairs)), key=lambda number: stamps_ns[number])
+        if max(abs(number - place) for place, number in enumerate(numbers)) > _MOST_OUT_OF_PLACE:
+            steps = np.diff(stamps_ns)
+            logger.warning(
+                "%s: the stamps of its headers go back by %.2f s at message %d: the times of recording are used",
+                topic,
+                -steps.min() / _NANOSECONDS,
+                int(steps.argmin()) + 1,
+            )
+            stamps_ns, numbers = self._times_ns, list(range(len(pairs)))
         self._numbers = [n for k, n in enumerate(numbers) if not k or stamps_ns[n] > stamps_ns[numbers[k - 1]]]
         if len(self._numbers) < len(pairs):
             logger.warning("%s: %d messages repeat a stamp: left out", topic, len(pairs) - len(self._numbers))
@@ -143,7 +154,8 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     stored = BagImages(bag, topic)
     stamps = stored.messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-    camera = own_camera(partial(_calibration, bag, topic, fps), asked, stored, path.absolute().parent)
+    calibration = partial(_calibration, bag, topic, fps, (stored.width, stored.height))
+    camera = own_camera(calibration, asked, stored, path.absolute().parent)
     mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
     T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)
     return RecordedSequence(
@@ -159,28 +171,33 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
 
 
 def camera_topics(path: Path) -> list[str]:
-    """Topics of a bag with pictures of a camera, without depth.
+    """Topics of a bag with pictures of a camera, without depth; rectified ones in place of the same camera's raw ones.
 
     Raises:
         SequenceError: the bag is damaged.
     """
     with closing(Bag(path)) as bag:
-        return [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if is_colour(bag.first(topic))]
+        topics = [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if is_colour(bag.first(topic))]
+    rectified = {_home(topic) for topic in topics if is_rectified(topic)}
+    return [topic for topic in topics if is_rectified(topic) or _home(topic) not in rectified]
 
 
-def _calibration(bag: Bag, topic: str, fps: float) -> CameraFile:
+def _calibration(bag: Bag, topic: str, fps: float, size: tuple[int, int]) -> CameraFile:
     """By the ``camera_info`` beside the images."""
     known = bag.topics(CAMERA_INFO)
-    base = topic.removesuffix("/compressed")
-    home = base.rpartition("/")[0]
+    base, home = topic.removesuffix("/compressed"), _home(topic)
     info = next((name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None)
     if info is None:
         raise SequenceError(
             f"no {home}/camera_info for {topic} in {bag.path}: it has {', '.join(known) or 'no camera_info'}; give "
             f"--camera"
         )
-    is_rectified = base.rpartition("/")[2].startswith("image_rect")
-    return camera_file_of(bag.first(info), is_rectified, fps, f"{info} in {bag.path}")
+    return camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
+
+
+def _home(topic: str) -> str:
+    """The namespace of a camera."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
 def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray) -> FloatArray | None:

@@ -79,24 +79,43 @@ def image_of(message: Any, where: str) -> Image:
     return np.array(picture if conversion is None else cv2.cvtColor(picture, conversion), dtype=np.uint8)
 
 
-def camera_file_of(info: Any, is_rectified: bool, fps: float, where: str) -> CameraFile:
-    """The camera of a ``CameraInfo``: K with its distortion, or P of rectified images.
+def camera_file_of(
+    info: Any, rectified: bool, fps: float, where: str, size: tuple[int, int] | None = None
+) -> CameraFile:
+    """The camera of a ``CameraInfo``: K with its distortion, or P of rectified images, of the images as they come.
+
+    The calibration is of the whole sensor; images are its region of interest, binned (REP 104). Some drivers state a
+    binning of images that are whole: those of ``size`` (width, height) as large as the calibration are.
 
     Raises:
         SequenceError, DataError: it was not calibrated, or the model of the lens is unknown.
     """
     K, P, distortion = (getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd")
-    model = "" if is_rectified or not np.any(distortion) else info.distortion_model
+    model = "" if rectified or not np.any(distortion) else info.distortion_model
     if model not in _MODELS:
         known = ", ".join(name for name in _MODELS if name)
         raise SequenceError(f"{where} has distortion_model {model}; known are {known}: give --camera")
-    fx, _, cx, *_ = P if is_rectified else K
-    fy, cy = (P[5], P[6]) if is_rectified else (K[4], K[5])
+    fx, _, cx, *_ = P if rectified else K
+    fy, cy = (P[5], P[6]) if rectified else (K[4], K[5])
     if not (fx > 0 and fy > 0):
         raise SequenceError(f"{where} has no calibration, its focal length is {fx:g}: give --camera")
-    keys = {"width": info.width, "height": info.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
+    width, height, roi = info.width, info.height, info.roi
+    if size != (width, height):
+        binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)
+        if roi.width and roi.height:
+            width, height = roi.width, roi.height
+        width, height = width // binning_x, height // binning_y
+        fx, fy = fx / binning_x, fy / binning_y
+        cx = (cx - roi.x_offset + 0.5) / binning_x - 0.5
+        cy = (cy - roi.y_offset + 0.5) / binning_y - 0.5
+    keys = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
     coefficients = [] if _MODELS[model] == "pinhole" else [float(value) for value in distortion]
     return camera_of({**keys, "model": _MODELS[model], "distortion": coefficients}, where)
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether a topic of images is named as rectified ones are."""
+    return topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
 
 
 def points_of(cloud: Any, where: str) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,50 @@ def test_calibration(new_bag: NewBag, kind: str) -> None:
     with pytest.raises(SequenceError, match=r"no /bare/camera_info for /bare/image_raw .*give --camera"):
         open_sequence(path, "/bare/image_raw")
     assert open_sequence(path, "/bare/image_raw", Path("fov=90")).intrinsics.fx == pytest.approx(20)
+
+
+def test_images_are_a_binned_region_of_the_calibrated_sensor(new_bag: NewBag, kind: str) -> None:
+    """A sensor of 87x60 with its calibration; the images show 80x48 of it, binned to 40x24."""
+    sensor = Intrinsics(87, 60, 60, 60, 44.5, 31.5)
+    bag = new_bag(kind)
+    bag.camera_info("/part/camera_info", sensor, "plumb_bob", (), 2, (4, 7, 81, 48))
+    bag.camera_info("/all/camera_info", replace(sensor, width=40, height=24, cx=20, cy=12), "plumb_bob", (), 2)
+    for topic in ("/part/image_raw", "/all/image_raw"):
+        bag.image(topic, FIRST_NS, picture(0), "mono8")
+    path = bag.close()
+    assert open_sequence(path, "/part/image_raw").intrinsics == CAMERA
+    assert open_sequence(path, "/all/image_raw").intrinsics.fx == 60  # the driver states a binning of whole images
+
+
+def test_rectified_images_stand_for_the_raw_ones_beside_them(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    bag.image("/cam0/image_rect", FIRST_NS, picture(0), "mono8")
+    (name,) = sequence_names(path := bag.close())
+    assert name == "/cam0/image_rect" and open_sequence(path).intrinsics.fx == 31
+
+
+def test_a_clock_that_was_set_back_gives_way_to_the_times_of_recording(
+    new_bag: NewBag, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
+    for k in range(40):
+        early_ns = 21 * STEP_NS if k >= 20 else 0
+        bag.image("/cam0/image_raw", FIRST_NS + k * STEP_NS - early_ns, picture(k), "mono8", late_ns=early_ns)
+    sequence = open_sequence(bag.close())
+    np.testing.assert_allclose(np.diff(sequence.stamps), STEP_NS / 1e9, atol=1e-6)
+    np.testing.assert_array_equal(sequence.frame(21).image[:, :, 0], picture(21))
+    assert "1.00 s at message 20" in caplog.text
+
+
+def test_a_camera_file_beside_a_bag_may_have_the_height_alone(new_bag: NewBag) -> None:
+    bag = new_bag()
+    drive(bag)
+    path = bag.close()
+    (path.parent / "camera.yaml").write_text("camera_height_m: 1.3\n")
+    sequence = open_sequence(path)
+    assert sequence.camera_height_m == 1.3 and sequence.intrinsics == CAMERA
 
 
 def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag, kind: str) -> None:

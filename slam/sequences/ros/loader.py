@@ -6,15 +6,16 @@ import functools
 import logging
 import re
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
-from erfsfm.common.readers.images import first_usual
+from erfsfm.common.readers.images import Stretch, first_usual
 from slam.formats.rows import BadRows
 from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
@@ -30,11 +31,13 @@ from slam.sequences.ros.messages import (
     COMPRESSED_IMAGE,
     IMAGE,
     POINT_CLOUD,
+    SIXTEEN_BITS,
     camera_file_of,
     image_of,
-    is_colour,
     is_rectified,
     points_of,
+    shows_pictures,
+    values_of,
 )
 from slam.sequences.ros.transforms import StaticTransforms, transform_of
 
@@ -46,6 +49,7 @@ _CACHED_FRAMES = 32
 _MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
 _SKIPPED_FRAMES = 30
+_STRETCHED_BY = 16  # images
 _SCAN_DELAY_S = 0.05
 _NANOSECONDS = 10**9
 
@@ -121,6 +125,7 @@ class BagImages:
         """
         self.messages = StampedMessages(bag, topic)
         self._where = f"an image of {topic} in {bag.path}"
+        self._stretch = self._common_stretch()
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
         self.height, self.width = first_usual(range(len(self))[:_SOUGHT_IMAGES], self._cached)[1].shape[:2]
 
@@ -141,7 +146,18 @@ class BagImages:
         return image.copy()
 
     def _decode(self, index: int) -> Image:
-        return image_of(self.messages.read(index), self._where)
+        return image_of(self.messages.read(index), self._where, self._stretch)
+
+    def _common_stretch(self) -> Stretch | None:
+        """By some images; None where they have eight bits, or are compressed."""
+        seen: list[NDArray[np.uint16]] = []
+        for index in range(0, len(self), max(len(self) // _STRETCHED_BY, 1)):
+            message = self.messages.read(index)
+            if getattr(message, "encoding", "") not in SIXTEEN_BITS:
+                return None
+            with suppress(SequenceError):
+                seen.append(values_of(message, self._where))
+        return Stretch.of(seen) if seen else None
 
 
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
@@ -177,7 +193,7 @@ def camera_topics(path: Path) -> list[str]:
         SequenceError: the bag is damaged.
     """
     with closing(Bag(path)) as bag:
-        topics = [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if is_colour(bag.first(topic))]
+        topics = [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if shows_pictures(bag.first(topic), topic)]
     rectified = {_home(topic) for topic in topics if is_rectified(topic)}
     return [topic for topic in topics if is_rectified(topic) or _home(topic) not in rectified]
 

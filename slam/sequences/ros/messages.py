@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
-from erfsfm.common.readers.images import decode_image, eight_bits
+from erfsfm.common.readers.images import Stretch, decode_image
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -27,6 +27,7 @@ _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenC
     "mono8": (1, cv2.COLOR_GRAY2RGB),
     "8UC1": (1, cv2.COLOR_GRAY2RGB),
     "mono16": (1, cv2.COLOR_GRAY2RGB),
+    "16UC1": (1, cv2.COLOR_GRAY2RGB),
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
@@ -34,6 +35,7 @@ _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenC
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
+SIXTEEN_BITS = ("mono16", "16UC1")
 _MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
     "": "pinhole",
     "none": "pinhole",
@@ -45,26 +47,25 @@ _MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
 _FLOAT32 = 7  # PointField.FLOAT32
 
 
-def is_colour(message: Any) -> bool:
-    """Whether an image or compressed image shows what a camera sees, not depth."""
+def shows_pictures(message: Any, topic: str) -> bool:
+    """Whether an image or compressed image of a topic shows what a camera sees, not depth."""
     if hasattr(message, "encoding"):
-        return message.encoding in _CONVERSIONS
+        is_depth = message.encoding == "16UC1" and "depth" in topic.lower()
+        return message.encoding in _CONVERSIONS and not is_depth
     return "compressedDepth" not in message.format
 
 
-def image_of(message: Any, where: str) -> Image:
-    """The picture ``(H, W, 3)`` uint8 RGB of an ``Image`` or a ``CompressedImage``.
+def values_of(message: Any, where: str) -> NDArray[Any]:
+    """The values ``(H, W, C)`` of an ``Image`` as stored.
 
     Raises:
-        SequenceError, DataError: an encoding that is not known, or too few bytes.
+        SequenceError: an encoding that is not known, or too few bytes.
     """
-    if hasattr(message, "format"):
-        return decode_image(bytes(message.data), where)
     encoding = message.encoding
     if encoding not in _CONVERSIONS:
         raise SequenceError(f"{where} has encoding {encoding}; known are {', '.join(_CONVERSIONS)}")
-    channels, conversion = _CONVERSIONS[encoding]
-    sample = np.dtype(np.uint16 if encoding == "mono16" else np.uint8).newbyteorder(
+    channels, _ = _CONVERSIONS[encoding]
+    sample = np.dtype(np.uint16 if encoding in SIXTEEN_BITS else np.uint8).newbyteorder(
         ">" if message.is_bigendian else "<"
     )
     height, width, step = message.height, message.width, message.step
@@ -73,9 +74,22 @@ def image_of(message: Any, where: str) -> Image:
     if not 0 < row <= step or len(data) < height * step:
         raise SequenceError(f"{where} has {len(data)} bytes for {width}x{height} pixels of {encoding}")
     values = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row]).view(sample)
-    if encoding == "mono16":
-        values = eight_bits(values.astype(np.uint16), where)
-    picture = values.reshape(height, width, channels)
+    return values.reshape(height, width, channels).astype(sample.newbyteorder("="))
+
+
+def image_of(message: Any, where: str, stretch: Stretch | None = None) -> Image:
+    """The picture ``(H, W, 3)`` uint8 RGB of an ``Image`` or a ``CompressedImage``.
+
+    Values of 16 bits are stretched; without a ``stretch`` by their own range.
+
+    Raises:
+        SequenceError, DataError: an encoding that is not known, or too few bytes.
+    """
+    if hasattr(message, "format"):
+        return decode_image(bytes(message.data), where, stretch)
+    picture, (_, conversion) = values_of(message, where), _CONVERSIONS[message.encoding]
+    if picture.dtype == np.uint16:
+        picture = (stretch or Stretch.of([picture])).apply(picture)
     return np.array(picture if conversion is None else cv2.cvtColor(picture, conversion), dtype=np.uint8)
 
 

@@ -89,6 +89,7 @@ def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
         ("yuv422", 2),
         ("yuv422_yuy2", 2),
         ("mono16", 1),
+        ("16UC1", 1),
     ],
 )
 def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: int) -> None:
@@ -97,7 +98,7 @@ def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: i
     pixels = np.full((24, 40, channels), level, np.uint8)
     if channels == 2:
         pixels[:, :, 0 if encoding == "yuv422" else 1] = 128
-    elif encoding == "mono16":
+    elif encoding in ("mono16", "16UC1"):
         pixels = np.full((24, 40), level * 256 + 7, np.uint16)
     bag = new_bag()
     bag.camera_info("/c/camera_info", CAMERA, "", ())

@@ -81,6 +81,14 @@ def test_stamps_that_cannot_be_seconds_are_refused(tmp_path: Path, images, camer
         open_sequence(tmp_path)
 
 
+@pytest.mark.parametrize("form", ["{}.{:06d}.png", "{}{:06d}000.png", "left_{}{:06d}.png"])
+def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: str) -> None:
+    microseconds = [900_000, 933_333, 1_200_000]
+    images(tmp_path, [form.format(1403715273 + each // 10**6, each % 10**6) for each in microseconds])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx(np.diff(microseconds) / 1e6, abs=1e-6)
+
+
 def test_unlikely_stamps_and_pauses_are_warned_of(
     tmp_path: Path, images, camera_yaml: str, caplog: pytest.LogCaptureFixture
 ) -> None:

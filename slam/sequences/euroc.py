@@ -29,7 +29,8 @@ from slam.sequences.recording import RecordedSequence, Source
 logger = logging.getLogger(__name__)
 
 _CAMERAS = ("cam0", "cam1")
-_TRUTH = "state_groundtruth_estimate0"
+_TRUTH = ("state_groundtruth_estimate0", "mocap0", "vicon0")  # the first that is there
+_POSITIONS = "leica0"
 _NANOSECONDS = 10**9
 _RIGID_TOLERANCE = 0.01
 _MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
@@ -66,7 +67,7 @@ def open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
         camera=camera,
         stamps=stamps,
         sources=(Source(f"euroc/{name}"),),
-        T_any_camera=_true_poses(body / _TRUTH, stamps, sensor),
+        T_any_camera=_true_poses(body, stamps, sensor),
     )
 
 
@@ -125,14 +126,17 @@ def _read_sensor(path: Path) -> _Sensor:
     return _Sensor(path, keys if isinstance(keys, dict) else {})
 
 
-def _true_poses(folder: Path, stamps: FloatArray, camera: Path) -> FloatArray | None:
+def _true_poses(body: Path, stamps: FloatArray, camera: Path) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps, NaN where unknown; None without ground truth.
 
     ``camera`` is the ``sensor.yaml`` that says where the camera sits.
     """
-    table = folder / "data.csv"
-    if not table.exists():
+    folder = next((body / name for name in _TRUTH if (body / name / "data.csv").exists()), None)
+    if folder is None:
+        if (body / _POSITIONS).is_dir():
+            logger.warning("%s has true positions without rotations: they are not used", body / _POSITIONS)
         return None
+    table = folder / "data.csv"
     if not camera.exists():
         logger.warning(
             "the true poses in %s are not used: %s, which says where the camera sits, is missing", table, camera

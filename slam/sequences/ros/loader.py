@@ -39,11 +39,17 @@ from slam.sequences.ros.messages import (
     shows_pictures,
     values_of,
 )
-from slam.sequences.ros.transforms import StaticTransforms, transform_of
+from slam.sequences.ros.transforms import StaticTransforms, moving_frames, transform_of
 
 logger = logging.getLogger(__name__)
 
-_ODOMETRY, _TRANSFORM = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"
+_POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TransformStamped",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+_FIX = "sensor_msgs/msg/NavSatFix"
 _TRUTH = re.compile(r"ground_?truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack", re.IGNORECASE)
 _CACHED_FRAMES = 32
 _MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
@@ -217,17 +223,24 @@ def _home(topic: str) -> str:
 
 
 def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray) -> FloatArray | None:
-    """``T_any_camera`` at the images' stamps from a topic that is named as truth, NaN where unknown; None without."""
-    topics = [topic for topic in bag.topics(_ODOMETRY, _TRANSFORM) if _TRUTH.search(topic)]
-    for topic in topics:
-        body = bag.first(topic).child_frame_id
-        T_body_camera = mounted.between(body, camera)
+    """``T_any_camera`` at the images' stamps from a topic or frame that is named as truth, NaN where unknown."""
+    topics = bag.topics(*_POSES)
+    for topic in filter(_TRUTH.search, topics):
+        body = getattr(bag.first(topic), "child_frame_id", None)
+        T_body_camera = np.eye(4) if body is None else mounted.between(body, camera)
         if T_body_camera is None:
             logger.warning("%s is not used: no static transform from its %r to the camera's %r", topic, body, camera)
             continue
-        found = StampedMessages(bag, topic)
-        known, T_any_body = _poses(found)
+        if body is None:
+            logger.warning("%s does not say whose poses it has: they are taken for the camera's", topic)
+        known, T_any_body = _poses(StampedMessages(bag, topic))
         return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
+    for (parent, body), (known, T_any_body) in moving_frames(bag).items():
+        T_body_camera = mounted.between(body, camera)
+        if T_body_camera is not None and _TRUTH.search(parent):
+            return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
+    for topic in (*topics, *bag.topics(_FIX)):
+        logger.warning("%s (%s) is not used: its name does not say that it is the truth", topic, bag.types[topic])
     return None
 
 
@@ -236,8 +249,10 @@ def _poses(messages: StampedMessages) -> tuple[FloatArray, FloatArray]:
     bad, good, T_any_body = BadRows(f"topic {messages.topic}", SequenceError), [], []
     for number in range(len(messages)):
         message = messages.read(number)
+        while hasattr(message, "pose"):  # with covariance, and with a header
+            message = message.pose
         try:
-            T_any_body.append(transform_of(message.pose.pose if hasattr(message, "pose") else message.transform))
+            T_any_body.append(transform_of(getattr(message, "transform", message)))
             good.append(number)
         except ValueError as error:
             bad.add(number, str(error))

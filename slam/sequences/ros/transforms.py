@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from slam.sequences.ros.bag import Bag
 
 logger = logging.getLogger(__name__)
 
-TOPIC = "/tf_static"
+TOPIC, MOVING_TOPIC = "/tf_static", "/tf"
 
 
 class StaticTransforms:
@@ -47,6 +48,22 @@ class StaticTransforms:
             seen.add(frame)
             T_root_frame = T_parent_child @ T_root_frame
         return frame, T_root_frame
+
+
+def moving_frames(bag: Bag) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+    """Stamps ``(M,)`` and ``T_parent_child`` ``(M, 4, 4)`` of the frames of ``/tf``, by parent and child."""
+    found: dict[tuple[str, str], dict[float, FloatArray]] = {}
+    for message in bag.messages(MOVING_TOPIC) if MOVING_TOPIC in bag.types else ():
+        for each in message.transforms:
+            stamp = each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec
+            with suppress(ValueError):
+                frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+                found.setdefault(frames, {}).setdefault(stamp, transform_of(each.transform))
+    moving = {}
+    for frames, poses in found.items():
+        stamps = sorted(poses)
+        moving[frames] = np.array(stamps), np.stack([poses[stamp] for stamp in stamps])
+    return moving
 
 
 def frame_name(text: str) -> str:

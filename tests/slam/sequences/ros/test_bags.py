@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import struct
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
@@ -256,6 +257,53 @@ def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
     with pytest.raises(SequenceError, match=r"bag .*walk.* cannot be read") as caught:
         open_sequence(path)
     assert "\n" not in str(caught.value)
+
+
+def test_an_mcap_of_another_program_is_named_with_its_schema_and_encoding(tmp_path: Path) -> None:
+    def record(kind: int, content: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(content)) + content
+
+    def text(words: str) -> bytes:
+        return struct.pack("<I", len(words)) + words.encode()
+
+    magic = b"\x89MCAP0\r\n"
+    start = magic + record(1, text("") + text("test"))
+    schema = record(3, struct.pack("<H", 1) + text("foxglove.RawImage") + text("jsonschema") + text("{}"))
+    channel = record(4, struct.pack("<HH", 1, 1) + text("/cam") + text("json") + struct.pack("<I", 0))
+    footer = record(2, struct.pack("<QQI", len(start), 0, 0))
+    (tmp_path / "walk.mcap").write_bytes(start + schema + channel + footer + magic)
+    with pytest.raises(SequenceError, match=r"not of ROS: it holds /cam \(foxglove.RawImage, json\)"):
+        open_sequence(tmp_path / "walk.mcap")
+
+
+def test_true_poses_of_a_tracker_in_tf(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    bag.mount("rig", "camera", bag.transform((0, 0, 1)))
+    for k in range(-1, FRAMES + 1):
+        each = bag.stamped_transform(FIRST_NS + k * STEP_NS, "vicon/world", "rig", bag.transform((k, 5, 0)))
+        bag.write("/tf", FIRST_NS + k * STEP_NS, bag.make("tf2_msgs/msg/TFMessage", transforms=[each]))
+    reference = open_sequence(bag.close()).reference
+    assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
+
+
+@pytest.mark.parametrize("topic", ["/mocap/pose", "/pose"])
+def test_stamped_poses_are_the_truth_where_their_topic_says_so(
+    new_bag: NewBag, kind: str, topic: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    for k in range(-1, FRAMES + 1):
+        where = bag.transform((k, 5, 0))
+        point = bag.make("geometry_msgs/msg/Point", x=float(k), y=5.0, z=0.0)
+        pose = bag.make("geometry_msgs/msg/Pose", position=point, orientation=where.rotation)
+        stamp = FIRST_NS + k * STEP_NS
+        bag.write(topic, stamp, bag.make("geometry_msgs/msg/PoseStamped", header=bag.header(stamp, "w"), pose=pose))
+    reference = open_sequence(bag.close()).reference
+    if topic == "/pose":
+        assert reference is None and "/pose (geometry_msgs/msg/PoseStamped) is not used" in caplog.text
+    else:
+        assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
 
 
 def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str) -> None:

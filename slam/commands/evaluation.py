@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +13,7 @@ from slam.commands.options import Json, UnusedDevice, UnusedSeed
 from slam.runtime.errors import SlamError
 from slam.runtime.terminal import print_table
 
+logger = logging.getLogger(__name__)
 verbs = typer.Typer()
 
 
@@ -96,14 +98,18 @@ def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
 
 
 def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
+    from slam.evaluation.mistakes import likely_mistakes
     from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
     from slam.formats.trajectory import associate
     from slam.results.systems import trajectory_at
     from slam.results.terminal_tables import metrics_table
     from slam.runtime.run_files import REFERENCE
 
-    pair = associate(trajectory_at(estimate, format), trajectory_at(reference, format, REFERENCE))
+    whole = trajectory_at(estimate, format), trajectory_at(reference, format, REFERENCE)
+    pair = associate(*whole)
     metrics = trajectory_metrics(*pair)
+    for line in likely_mistakes(*whole, pair):
+        logger.warning(line)
     if as_json:
         typer.echo(metrics.to_json())
     else:

@@ -19,7 +19,12 @@ from pydantic import Field
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
 from slam.evaluation.drift import KITTI_LENGTHS_M, relative_errors, segment_errors
-from slam.formats.trajectory import Trajectory, matching_tolerance_s, read_trajectory
+from slam.formats.trajectory import (
+    Trajectory,
+    associate,
+    matching_tolerance_s,
+    read_trajectory,
+)
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import ConfigError, TrajectoryError
@@ -153,13 +158,17 @@ def align(T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment
 
 
 def evo_commands(estimate: Path | str, reference: Path | str, format: str = "auto") -> list[str]:
-    """The evo commands that give the numbers of ``evo`` for two files; none for files of two formats.
+    """The evo commands that give the numbers of ``evo`` for two files.
+
+    None for files of two formats, with bad rows, or with stamps so different that poses are interpolated.
 
     Raises:
         TrajectoryError: if a file cannot be read in this format.
     """
     a, b = read_trajectory(estimate, format), read_trajectory(reference, format)
-    if a.timed != b.timed:
+    if a.timed != b.timed or a.rows or b.rows:
+        return []
+    if not all(np.isin(ours.stamps, whole.stamps).all() for ours, whole in zip(associate(a, b), (a, b))):
         return []
     files = f"{'tum' if a.timed else 'kitti'} {shlex.quote(str(reference))} {shlex.quote(str(estimate))}"
     options = "--align --correct_scale"

@@ -6,6 +6,7 @@ Conventions: ``docs/design/conventions.md``. Quaternions are those of TUM files.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
+from slam.formats.rows import BadRows
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
@@ -22,13 +24,16 @@ from slam.runtime.storage.files import write_atomically
 
 logger = logging.getLogger(__name__)
 
-# columns of a row by format; the second form of each is with a frame number, and without a stamp
-_COLUMNS = {"kitti": (12, 13), "tum": (8, 7)}
+# columns of a row by format: KITTI's of 3x4 and of 4x4 with a frame number or without, TUM's without a stamp last
+_COLUMNS = {"kitti": (12, 13, 16, 17), "tum": (8, 7)}
+_NANOSECOND_DIGITS = 15  # of a stamp in nanoseconds, at least: seconds have 10
 # a TartanAir camera looks along x, with y to the right and z down
 _T_TARTAN_CAMERA = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST = 1e12  # metres: to Saturn
+_SAME_STAMP = 0.05  # of the period: stamps of one image differ by less
+_LONE_PERIOD_S = 0.04  # of a trajectory of one pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +42,15 @@ class Trajectory:
 
     ``stamps`` ``(N,)`` in seconds, ``T_world_camera`` ``(N, 4, 4)``, metres or the trajectory's own unit.
     ``timed`` is False where the stamps are row numbers, as in a KITTI file; ``numbered`` is True where they are frame
-    numbers that the file gives.
+    numbers that the file gives. ``rows`` is the number of rows of a file without either of which bad ones are left out;
+    the others keep their row numbers as stamps.
     """
 
     stamps: FloatArray
     T_world_camera: FloatArray
     timed: bool = True
     numbered: bool = False
+    rows: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse shapes that do not fit, and stamps that are no times.
@@ -73,10 +80,25 @@ class Trajectory:
         """Length of the path through all positions."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
+    @property
+    def frame_count(self) -> int:
+        """Number of frames that rows without stamps stand for, those of bad rows among them."""
+        return self.rows or len(self)
+
+    @property
+    def frame_numbers(self) -> NDArray[np.intp]:
+        """``(N,)``: those of the file, else the row numbers."""
+        by_stamps = self.numbered or self.rows is not None
+        return self.stamps.astype(np.intp) if by_stamps else np.arange(len(self))
+
     def rebased(self) -> Trajectory:
         """The same motion with the first camera as the world: the first pose is the identity."""
         T_first_world = se3.invert(self.T_world_camera[0])
         return replace(self, T_world_camera=T_first_world @ self.T_world_camera)
+
+    def at(self, stamps: FloatArray) -> Trajectory:
+        """Interpolated poses of a timed trajectory at stamps ``(M,)``; its ends are held."""
+        return Trajectory(stamps, se3.interpolate(self.T_world_camera, self.stamps, stamps))
 
     def select(self, rows: NDArray[np.intp]) -> Trajectory:
         """The poses of some rows, in the order given."""
@@ -84,11 +106,13 @@ class Trajectory:
 
 
 def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
-    """Read a KITTI file (12 numbers a row, or 13 with the frame number first) or a TUM file (8); ``auto`` decides.
+    """Read a KITTI or a TUM file, or the ``data.csv`` of EuRoC's true poses; ``auto`` decides by the columns.
 
-    Rows of 7 numbers are TartanVO's: position and quaternion of a camera that looks along x, with z down. Blank lines
-    and lines that start with ``#`` are skipped. Rotations that are not orthonormal by rounding are replaced by the
-    nearest rotation.
+    A row of KITTI has 12 numbers, or the 16 of a 4x4 matrix, perhaps with the frame number first; one of TUM 8. Rows
+    of 7 numbers are TartanVO's: position and quaternion of a camera that looks along x, with z down. EuRoC's columns
+    are separated by commas: nanoseconds, position, quaternion w x y z and others. A header, blank lines and those that
+    start with ``#`` are skipped; bad rows are left out (`slam.formats.rows`), and where rows have no stamps the others
+    keep their numbers. Rotations that are not orthonormal by rounding are replaced by the nearest rotation.
 
     Raises:
         TrajectoryError: if the file cannot be read as such; the message names file and line.
@@ -96,27 +120,37 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     path = Path(path)
     if format not in ("auto", *_COLUMNS):
         raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
-    lines, numbers = _read_numbers(path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]))
-    columns = numbers.shape[1]
+    bad = BadRows(path, TrajectoryError)
+    lines, rows, numbers = _read_numbers(path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad)
+    columns, good = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
+    lines, rows, numbers = bad.without(good, "a number is not finite", lines, rows, numbers)
     if columns in _COLUMNS["kitti"]:
-        T_world_camera = _kitti_poses(numbers[:, -12:])
+        T_world_camera = _kitti_poses(numbers[:, columns % 4 :][:, :12])
     else:
-        T_world_camera = _tum_poses(path, lines, numbers[:, -7:])
+        good = np.asarray(np.abs(np.linalg.norm(numbers[:, -4:], axis=1) - 1.0) < _ROTATION_TOLERANCE)
+        lines, rows, numbers = bad.without(good, "the quaternion does not have length 1", lines, rows, numbers)
+        T_world_camera = se3.make(Rotation.from_quat(numbers[:, -4:].reshape(-1, 4)).as_matrix(), numbers[:, -7:-4])
     if columns == 7:
         T_world_camera = _T_TARTAN_CAMERA.T @ T_world_camera @ _T_TARTAN_CAMERA
-    stamps = numbers[:, 0] if columns in (8, 13) else np.arange(len(numbers), dtype=np.float64)
-    backwards = np.flatnonzero(np.diff(stamps) <= 0)
-    if backwards.size:
-        what = "time stamps" if columns == 8 else "frame numbers"
-        raise TrajectoryError(f"{path}, line {lines[backwards[0] + 1]}: {what} must increase")
+    far = np.asarray((np.abs(T_world_camera[:, :3, 3]) > _FARTHEST).any(axis=1))
+    lines, rows, numbers, T_world_camera = bad.without(
+        ~far, f"a position is farther than {_FARTHEST:g}", lines, rows, numbers, T_world_camera
+    )
     R = T_world_camera[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # an overflow becomes NaN, which fails the check below
-        deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
-        wrong = np.flatnonzero(~((deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)))
-    if wrong.size:
-        raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the 3x3 part is not a rotation matrix")
-    T_world_camera[:, :3, :3] = se3.nearest_rotation(R)
-    return Trajectory(stamps, T_world_camera, timed=columns == 8, numbered=columns == 13)
+        deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        good = (deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)
+    lines, rows, numbers, T_world_camera = bad.without(
+        good, "the 3x3 part is not a rotation matrix", lines, rows, numbers, T_world_camera
+    )
+    timed, numbered = columns == 8, columns in (13, 17)
+    stamps = numbers[:, 0] if timed or numbered else rows.astype(np.float64)
+    order = bad.in_order(stamps, "time stamps" if timed else "frame numbers", lines)
+    bad.say(int(order.sum()), "a pose a row")
+    T_world_camera = T_world_camera[order]
+    T_world_camera[:, :3, :3] = se3.nearest_rotation(T_world_camera[:, :3, :3])
+    count = len(order) + len(bad) if len(bad) and not (timed or numbered) else None
+    return Trajectory(stamps[order], T_world_camera, timed, numbered, count)
 
 
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
@@ -148,8 +182,9 @@ def associate(
 ) -> tuple[Trajectory, Trajectory]:
     """The rows of both that belong to the same frames, equally many.
 
-    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. Otherwise rows are
-    matched by their frame numbers where one of the two has them, and else row k belongs to row k.
+    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`; where these stamps
+    differ, the denser trajectory is interpolated at those of the other. Otherwise rows are matched by their frame
+    numbers where one of the two has them, and else row k belongs to row k.
 
     Args:
         estimate: to be compared.
@@ -177,30 +212,36 @@ def associate(
     expected = min(len(estimate), len(reference))
     if rows_estimate.size < 0.9 * expected:
         logger.warning("only %d of %d poses have a matching time stamp", rows_estimate.size, expected)
-    return estimate.select(rows_estimate), reference.select(rows_reference)
+    pair = estimate.select(rows_estimate), reference.select(rows_reference)
+    apart = np.abs(pair[0].stamps - pair[1].stamps).max()
+    if apart <= _SAME_STAMP * min(_period_s(estimate), _period_s(reference)):
+        return pair
+    if _period_s(estimate) < _period_s(reference):
+        return estimate.at(pair[1].stamps), pair[1]
+    return pair[0], reference.at(pair[0].stamps)
 
 
 def _of_frames(trajectory: Trajectory, start: int, stop: int) -> Trajectory:
     """The frames [start, stop) with their numbers."""
-    numbers = trajectory.stamps if trajectory.numbered else np.arange(len(trajectory), dtype=np.float64)
-    if not trajectory.numbered and len(trajectory) == stop - start:
-        numbers += start
+    numbers = trajectory.frame_numbers
+    if not trajectory.numbered and trajectory.frame_count == stop - start:
+        numbers = numbers + start
     chosen = (numbers >= start) & (numbers < stop)
     if not chosen.any():
-        raise TrajectoryError(f"there are no poses of frames {start}:{stop}, only {numbers[0]:g} to {numbers[-1]:g}")
-    return Trajectory(numbers[chosen], trajectory.T_world_camera[chosen], timed=False, numbered=True)
+        raise TrajectoryError(f"there are no poses of frames {start}:{stop}, only {numbers[0]} to {numbers[-1]}")
+    return Trajectory(numbers[chosen].astype(np.float64), trajectory.T_world_camera[chosen], timed=False, numbered=True)
 
 
 def _same_frames(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
-    if not (estimate.numbered or reference.numbered):
-        if len(estimate) != len(reference):
-            raise TrajectoryError(
-                f"the estimate has {len(estimate)} poses and the reference {len(reference)}; files without "
-                "time stamps are compared row by row: give the frames of the estimate with --frames A:B and "
-                "--reference, or a row for each frame, or TUM files for both"
-            )
+    if not (estimate.numbered or reference.numbered) and estimate.frame_count != reference.frame_count:
+        raise TrajectoryError(
+            f"the estimate has {estimate.frame_count} poses and the reference {reference.frame_count}; files without "
+            "time stamps are compared row by row: give the frames of the estimate with --frames A:B and "
+            "--reference, or a row for each frame, or TUM files for both"
+        )
+    ours, theirs = estimate.frame_numbers, reference.frame_numbers
+    if np.array_equal(ours, theirs):
         return estimate, reference
-    ours, theirs = (each.stamps if each.numbered else np.arange(len(each)) for each in (estimate, reference))
     _, rows_estimate, rows_reference = np.intersect1d(ours, theirs, return_indices=True)
     if not rows_estimate.size:
         raise TrajectoryError("no frame numbers of the estimate are rows of the reference: give both from frame 0")
@@ -209,8 +250,11 @@ def _same_frames(estimate: Trajectory, reference: Trajectory) -> tuple[Trajector
 
 def matching_tolerance_s(estimate: Trajectory, reference: Trajectory) -> float:
     """Largest time difference of a matching pair: half the frame period (median) of the denser one."""
-    periods = [float(np.median(np.diff(each.stamps))) for each in (estimate, reference) if len(each) > 1]
-    return 0.5 * min(periods, default=0.02)
+    return 0.5 * min(_period_s(estimate), _period_s(reference))
+
+
+def _period_s(trajectory: Trajectory) -> float:
+    return float(np.median(np.diff(trajectory.stamps))) if len(trajectory) > 1 else _LONE_PERIOD_S
 
 
 def nearest_pairs(a: FloatArray, b: FloatArray, within_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -235,30 +279,28 @@ def _time_span(trajectory: Trajectory) -> str:
     return f"{trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
 
 
-def _read_numbers(path: Path, forms: tuple[int, ...]) -> tuple[list[int], FloatArray]:
-    """Line numbers and the table ``(N, columns)`` of a file, whose first row has one of these numbers of columns."""
-    lines: list[int] = []
-    rows: list[list[float]] = []
-    for line, words in _read_words(path):
-        _check_columns(f"{path}, line {line}", len(words), forms)
-        forms = (len(words),)
+def _read_numbers(
+    path: Path, forms: tuple[int, ...], bad: BadRows
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    """Line and row numbers ``(N,)`` of a file, and its table ``(N, columns)`` of the commonest of these forms."""
+    table = list(_read_words(path))
+    if table and not any(_is_number(word) for word in table[0][1]):
+        del table[0]  # a header
+    counts = Counter(len(words) for _, words in table)
+    columns = max(forms, key=lambda form: counts[form])
+    lines, rows, numbers = [], [], []
+    for row, (line, words) in enumerate(table):
+        if len(words) != columns:
+            bad.add(line, _other_columns(len(words), columns if counts[columns] else forms[0], forms))
+            continue
         try:
-            rows.append([_number(word) for word in words])
+            numbers.append([_number(word) for word in words])
         except ValueError as error:
-            raise TrajectoryError(f"{path}, line {line}: {_reason(error)}") from error
+            bad.add(line, str(error))
+            continue
         lines.append(line)
-    if not rows:
-        raise TrajectoryError(f"{path}: there is no pose in this file")
-    numbers = np.array(rows)
-    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
-    if bad.size:
-        raise TrajectoryError(f"{path}, line {lines[bad[0]]}: a number is not finite")
-    kitti = numbers.shape[1] in _COLUMNS["kitti"]
-    positions = numbers[:, -12:][:, 3::4] if kitti else numbers[:, -7:-4]
-    far = np.flatnonzero((np.abs(positions) > _FARTHEST).any(axis=1))
-    if far.size:
-        raise TrajectoryError(f"{path}, line {lines[far[0]]}: a position is farther than {_FARTHEST:g}")
-    return lines, numbers
+        rows.append(row)
+    return np.array(lines, np.intp), np.array(rows, np.intp), np.array(numbers).reshape(-1, columns)
 
 
 def _number(word: str) -> float:
@@ -267,9 +309,17 @@ def _number(word: str) -> float:
     Raises:
         ValueError: it is none.
     """
-    if "_" in word:
-        raise ValueError(f"not a number: {word!r}")
+    if not _is_number(word):
+        hint = "; decimals are written with a point" if _is_number(word.replace(",", ".")) else ""
+        raise ValueError(f"not a number: {word!r}{hint}")
     return float(word)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return "_" not in word and float(word) is not None
+    except ValueError:
+        return False
 
 
 def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -285,39 +335,32 @@ def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
     except OSError as error:
         raise TrajectoryError(f"{path}: {error.strerror}") from error
     for line, content in enumerate(text.splitlines(), start=1):
-        words = content.split()
-        if words and not words[0].startswith("#"):
-            yield line, words
+        if content.strip() and not content.lstrip().startswith("#"):
+            yield line, _words(content)
 
 
-def _check_columns(where: str, found: int, wanted: tuple[int, ...]) -> None:
-    if found in wanted:
-        return
-    if len(wanted) > 2:
-        raise TrajectoryError(f"{where}: {found} columns; a KITTI row has 12, a TUM row 8")
-    name = "KITTI" if wanted[0] in _COLUMNS["kitti"] else "TUM"
-    other = {12: "; this looks like a KITTI row", 8: "; this looks like a TUM row"}.get(found, "")
-    raise TrajectoryError(f"{where}: {found} columns where {name} has {wanted[0]}{other}")
+def _words(line: str) -> list[str]:
+    """The words of a row; of EuRoC's the stamp in seconds and the quaternion as TUM has them."""
+    words = [word.strip() for word in line.split(",")]
+    if len(words) < _COLUMNS["tum"][0] or any(" " in word for word in words):
+        words = line.split()
+    if len(words) >= _COLUMNS["tum"][0] and words[0].isdecimal() and len(words[0]) >= _NANOSECOND_DIGITS:
+        stamp = f"{words[0][:-9]}.{words[0][-9:]}"
+        words = [stamp, *words[1:4], *words[5:8], words[4]] if "," in line else [stamp, *words[1:]]
+    return words
 
 
-def _reason(error: ValueError) -> str:
-    """Python's message about a word that is not a number, reworded."""
-    return str(error).replace("could not convert string to float:", "not a number:")
+def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:
+    if len(forms) > len(_COLUMNS["kitti"]) and wanted == forms[0]:
+        return f"{count} columns; a KITTI row has 12, a TUM row 8"
+    other = {12: "; this looks like a KITTI row", 8: "; this looks like a TUM row"}.get(count, "")
+    return f"{count} columns where {'KITTI' if wanted in _COLUMNS['kitti'] else 'TUM'} has {wanted}{other}"
 
 
 def _kitti_poses(numbers: FloatArray) -> FloatArray:
     T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
     T_world_camera[:, :3] = numbers.reshape(-1, 3, 4)
     return T_world_camera
-
-
-def _tum_poses(path: Path, lines: list[int], numbers: FloatArray) -> FloatArray:
-    quaternions_xyzw = numbers[:, 3:]
-    deviation = np.abs(np.linalg.norm(quaternions_xyzw, axis=1) - 1.0)
-    wrong = np.flatnonzero(deviation >= _ROTATION_TOLERANCE)
-    if wrong.size:
-        raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the quaternion does not have length 1")
-    return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, :3])
 
 
 def _row(values: Iterable[float]) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 FloatArray = NDArray[np.float64]
 
@@ -62,6 +62,14 @@ def chain(T_previous_next: FloatArray) -> FloatArray:
     for k, increment in enumerate(rigid(T_previous_next)):
         np.matmul(T_first_k[k], increment, out=T_first_k[k + 1])
     return T_first_k
+
+
+def interpolate(T_world_camera: FloatArray, known: FloatArray, stamps: FloatArray) -> FloatArray:
+    """Poses ``(N, 4, 4)`` at ``stamps`` ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``; ends are held."""
+    times = np.clip(stamps, known[0], known[-1])
+    R = Slerp(known, Rotation.from_matrix(T_world_camera[:, :3, :3]))(times).as_matrix()
+    t = np.column_stack([np.interp(times, known, T_world_camera[:, axis, 3]) for axis in range(3)])
+    return make(R, t)
 
 
 def path_distance(T_world_camera: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
 from slam.results.error_columns import COLUMNS, DASH, ErrorColumn, missing_by_reason, written
@@ -23,6 +25,8 @@ from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import Missing
 from slam.runtime.terminal import TerminalTable
 from slam.sequences.excerpt import frame_range
+
+logger = logging.getLogger(__name__)
 
 _COLUMNS = COLUMNS[:-1]  # without the difference to evo
 
@@ -104,6 +108,8 @@ def compare(
             pair = associate(estimate, truth, chosen)
         except TrajectoryError as error:
             raise TrajectoryError(f"{path}: {error}") from error
+        for line in likely_mistakes(estimate, truth, pair):
+            logger.warning("%s: %s", path, line)
         runs.append(SystemRun(name, path, *pair, trajectory_metrics(*pair)))
     return runs
 

@@ -1,4 +1,4 @@
-"""Which camera a sequence has: a ``camera.yaml`` or a field of view given by the user, or the recording's own.
+"""Which camera a sequence has: a calibration or a field of view given by the user, or the recording's own.
 
 The keys of ``camera.yaml`` are described in `erfsfm.common.readers.camera_file`.
 """
@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
+from erfsfm.common.readers.pinhole import Pinhole
 from slam.runtime.errors import SequenceError, sequence_errors
+from slam.sequences.foreign_camera import read_foreign_camera
 
 DEFAULT_FPS = 10.0
 _FOV = re.compile(r"fov=(?P<fov>[\d.]+)(?:,fps=(?P<fps>[\d.]+))?")
@@ -68,19 +71,20 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
     """
     if is_field_of_view(given):
         return _of_field_of_view(str(given), images, fps or DEFAULT_FPS)
-    return read_explicit(given)
+    return read_explicit(given, fps)
 
 
 @sequence_errors()
-def read_explicit(path: Path) -> CameraFile:
-    """Read the camera file that the user named.
+def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
+    """Read the camera file that the user named, ours or of another program; ``fps`` is for one without a rate.
 
     Raises:
         SequenceError: if it does not exist or is wrong.
     """
     if not path.is_file():
         raise SequenceError(f"no camera file {path}: give a {CAMERA_FILE}, or fov=DEGREES")
-    return read_camera_file(path)
+    foreign = read_foreign_camera(path, fps or DEFAULT_FPS)
+    return read_camera_file(path) if foreign is None else foreign
 
 
 def own_camera(own: Callable[[], CameraFile], asked: Path | None, images: Sized, *folders: Path) -> CameraFile:
@@ -97,27 +101,31 @@ def own_camera(own: Callable[[], CameraFile], asked: Path | None, images: Sized,
     """
     if asked is not None:
         return explicit_camera(asked, images)
-    camera, found = own(), beside(*folders)
+    camera = own()
+    found = beside(*folders, own=camera.model_dump())
     if found is None:
         return camera
     return camera.model_copy(update={"camera_height_m": found.camera_height_m, "readout_ms": found.readout_ms})
 
 
 @sequence_errors()
-def beside(*folders: Path) -> CameraFile | None:
-    """The first ``camera.yaml`` found in ``folders``, or None.
+def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile | None:
+    """The first ``camera.yaml`` found in ``folders``, or None; keys that it lacks are those of the ``own`` camera.
 
     Raises:
         SequenceError: if it is wrong.
     """
     path = next((folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).exists()), None)
-    return None if path is None else read_camera_file(path)
+    return None if path is None else read_camera_file(path, own)
 
 
-def height_beside(usual_m: float | None, *folders: Path) -> float | None:
-    """The camera's height by the first ``camera.yaml`` found in ``folders``; ``usual_m`` where none says it."""
-    found = beside(*folders)
-    return usual_m if found is None else found.height_or(usual_m)
+def mount_beside(pinhole: Pinhole, usual_m: float | None, *folders: Path) -> tuple[float | None, float]:
+    """A calibrated camera's height in metres and read-out in seconds by the first ``camera.yaml`` in ``folders``.
+
+    ``usual_m`` is the height where none says it.
+    """
+    found = beside(*folders, own={**asdict(pinhole), "fps": DEFAULT_FPS})
+    return (usual_m, 0.0) if found is None else (found.height_or(usual_m), found.readout_ms / 1e3)
 
 
 def is_field_of_view(given: Path) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from erfsfm.common.errors import DataError
@@ -18,6 +19,7 @@ from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.ros import loader as ros
+from slam.sequences.series import find_series, open_series
 from slam.sequences.truth import take_truth
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
@@ -135,7 +137,16 @@ def _root(dataset: Path | None, name: str | None) -> Path:
 
 
 def _contents(root: Path, asked: Asked) -> dict[str, Found]:
-    """What a path holds, or else the folders in it; empty where nothing is of a known kind."""
+    """What a path holds, pieces of one recording as one; empty where nothing is of a known kind."""
+    found = _parts(root, asked)
+    for names in find_series({name: each.kind for name, each in found.items()}):
+        kind, openers = found[names[0]].kind, [found.pop(name).open for name in names]
+        found[names[0]] = Found(kind, partial(open_series, names, kind, openers))
+    return found
+
+
+def _parts(root: Path, asked: Asked) -> dict[str, Found]:
+    """What a path holds, or else the folders in it."""
     found = _recognised(root, asked)
     if found or root.is_file():
         return found

@@ -15,19 +15,22 @@ from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.numbering import by_table
 from erfsfm.common.yaml_file import parse_yaml
+from slam.formats.rows import BadRows
+from slam.formats.trajectory import read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import poses_near, poses_of
-from slam.sequences.recording import RecordedSequence, Source, require_stamps
+from slam.sequences.poses import poses_near
+from slam.sequences.recording import RecordedSequence, Source
 
 logger = logging.getLogger(__name__)
 
 _CAMERAS = ("cam0", "cam1")
-_TRUTH = "state_groundtruth_estimate0"
+_TRUTH = ("state_groundtruth_estimate0", "mocap0", "vicon0")  # the first that is there
+_POSITIONS = "leica0"
 _NANOSECONDS = 10**9
 _RIGID_TOLERANCE = 0.01
 _MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
@@ -51,14 +54,12 @@ def open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
     folder = _camera_folder(body)
     assert folder is not None
     table = folder / "data.csv"
-    rows = _rows(table)
-    stamps = np.array([_stamp(row[0], table) for row in rows])
-    listed = [folder / "data" / row[-1].strip() for row in rows]
+    stamps, listed = _read_index(table)
     files = by_table(listed, table)
     stored = ImageFiles(files)
     sensor = folder / "sensor.yaml"
     camera = own_camera(lambda: _read_sensor(sensor).camera(), asked, stored, body, body.parent)
-    stamps = require_stamps(stamps[: files.first + len(files)], table, files)
+    stamps = stamps[files.first :][: len(files)]
     name = body.parent.name
     return RecordedSequence(
         name=name,
@@ -66,7 +67,7 @@ def open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
         camera=camera,
         stamps=stamps,
         sources=(Source(f"euroc/{name}"),),
-        T_any_camera=_true_poses(body / _TRUTH, stamps, sensor),
+        T_any_camera=_true_poses(body, stamps, sensor),
     )
 
 
@@ -125,50 +126,47 @@ def _read_sensor(path: Path) -> _Sensor:
     return _Sensor(path, keys if isinstance(keys, dict) else {})
 
 
-def _true_poses(folder: Path, stamps: FloatArray, camera: Path) -> FloatArray | None:
+def _true_poses(body: Path, stamps: FloatArray, camera: Path) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps, NaN where unknown; None without ground truth.
 
     ``camera`` is the ``sensor.yaml`` that says where the camera sits.
     """
-    table = folder / "data.csv"
-    if not table.exists():
+    folder = next((body / name for name in _TRUTH if (body / name / "data.csv").exists()), None)
+    if folder is None:
+        if (body / _POSITIONS).is_dir():
+            logger.warning("%s has true positions without rotations: they are not used", body / _POSITIONS)
         return None
+    table = folder / "data.csv"
     if not camera.exists():
         logger.warning(
             "the true poses in %s are not used: %s, which says where the camera sits, is missing", table, camera
         )
         return None
-    rows = _rows(table)
-    known = np.array([_stamp(row[0], table) for row in rows])
-    try:
-        values = np.array([[float(value) for value in row[1:8]] for row in rows])  # position, quaternion wxyz
-        T_any_sensor = poses_of(values[:, :3], values[:, [4, 5, 6, 3]])
-    except (ValueError, IndexError) as error:
-        raise SequenceError(f"{table} needs stamp, position and quaternion in each row: {error}") from error
+    truth = read_trajectory(table)
     sensor = folder / "sensor.yaml"
     T_body_sensor = _read_sensor(sensor).T_body_sensor() if sensor.exists() else np.eye(4)
-    T_any_body = T_any_sensor @ se3.invert(T_body_sensor)
-    return poses_near(T_any_body @ _read_sensor(camera).T_body_sensor(), known, stamps, table)
+    T_any_body = truth.T_world_camera @ se3.invert(T_body_sensor)
+    return poses_near(T_any_body @ _read_sensor(camera).T_body_sensor(), truth.stamps, stamps, table)
 
 
-def _rows(table: Path) -> list[list[str]]:
-    """The rows of a table of EuRoC, comments left out; at least one."""
+def _read_index(table: Path) -> tuple[FloatArray, list[Path]]:
+    """Stamps in seconds and image paths of ``data.csv``, good rows in the order of time."""
     try:
         lines = read_text(table).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"cannot read {table}: {error}") from error
-    rows = [line.split(",") for line in lines if line.strip() and not line.startswith("#")]
-    if not rows:
-        raise SequenceError(f"{table} has no rows: it needs one for each image or pose; copy it again")
-    return rows
-
-
-def _stamp(word: str, table: Path) -> float:
-    """Seconds from a stamp in nanoseconds, rounded once."""
-    try:
-        return int(word) / _NANOSECONDS
-    except ValueError:
-        raise SequenceError(f"{table} has {word!r} where a stamp in nanoseconds belongs; correct the row") from None
+    bad = BadRows(table, SequenceError)
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        words = [word.strip() for word in line.split(",")]
+        if len(words) > 1 and words[0].isdecimal():
+            rows.append((number, int(words[0]) / _NANOSECONDS, table.parent / "data" / words[-1]))
+        elif line.strip() and not line.startswith("#"):
+            bad.add(number, f"{line!r} is not 'nanoseconds,file'")
+    stamps = np.array([stamp for _, stamp, _ in rows])
+    good = bad.in_order(stamps, "stamps", np.array([number for number, _, _ in rows], np.intp))
+    bad.say(int(good.sum()), "a row of nanoseconds and file for each image")
+    return stamps[good], [rows[k][2] for k in np.flatnonzero(good)]
 
 
 def _camera_folder(body: Path) -> Path | None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from erfsfm.common.readers.folder import image_folder, recording_name
 from erfsfm.common.readers.images import list_images
@@ -15,7 +19,11 @@ from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.recording import RecordedSequence, Source, read_stamps, uniform_stamps
 
+logger = logging.getLogger(__name__)
+
 TIMES = "times.txt"
+# seconds since 1970 with decimals, milli-, micro- or nanoseconds
+_NAMED_BY_TIME = re.compile(r"(?:\D*[_-])?(\d{10})(?:[._])?(\d{3,9})")
 
 
 def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
@@ -44,8 +52,17 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
 
 
 def _stamps(places: tuple[Path, ...], files: NumberedFiles, fps: float) -> FloatArray:
+    """By a file, by names that are times since 1970, or at the rate of the camera."""
     path = next((path for path in places if path.exists()), None)
-    return uniform_stamps(len(files), fps) if path is None else read_stamps(path, files)
+    if path is not None:
+        return read_stamps(path, files)
+    times = [_NAMED_BY_TIME.fullmatch(path.stem) for path in files.paths]
+    if len(times) == len(files) and all(times):
+        stamps = np.array([float(f"{match[1]}.{match[2]}") for match in times if match is not None])
+        if (np.diff(stamps) > 0).all():
+            logger.info("%s: names are taken for the times of the images", files.paths[0].parent)
+            return np.asarray(stamps)
+    return uniform_stamps(len(files), fps)
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:

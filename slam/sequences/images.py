@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from erfsfm.common.readers.images import first_usual, read_image
+from erfsfm.common.readers.images import first_usual, read_image, stretch_of
 from erfsfm.common.readers.numbering import NumberedFiles
 from slam.frames import Image
 from slam.runtime.errors import MissingFrameError, SequenceError
@@ -40,6 +40,7 @@ class ImageFiles:
             if last - first + 1 > MAX_GAP_FRAMES:
                 raise too_long(files, first, last)
         self._paths = dict(zip(files.rows, files.paths))
+        self._stretch = stretch_of(files.paths)
         self._sized_by, image = first_usual(files.paths, read_image)
         self.height, self.width = image.shape[:2]
 
@@ -61,7 +62,7 @@ class ImageFiles:
             raise MissingFrameError(
                 f"no image {self.files.file_name(index)} in {folder}: the numbering has a gap there"
             )
-        image = read_image(path)
+        image = read_image(path, self._stretch)
         height, width = image.shape[:2]
         if (height, width) != (self.height, self.width):
             raise SequenceError(

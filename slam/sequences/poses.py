@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
 from slam.frames import runs
@@ -47,16 +47,10 @@ def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
     return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), positions)
 
 
-def interpolated_poses(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray) -> FloatArray:
-    """Poses ``(N, 4, 4)`` at ``stamps`` ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``; ends are held."""
-    times = np.clip(stamps, known[0], known[-1])
-    R = Slerp(known, Rotation.from_matrix(T_any_camera[:, :3, :3]))(times).as_matrix()
-    t = np.column_stack([np.interp(times, known, T_any_camera[:, axis, 3]) for axis in range(3)])
-    return se3.make(R, t)
-
-
 def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path) -> FloatArray:
-    """Poses as of `interpolated_poses`; NaN, with a warning, where the nearest known pose is more than 0.1 s away.
+    """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``.
+
+    NaN, with a warning, where the nearest known pose is more than 0.1 s away.
 
     Raises:
         SequenceError: the stamps of the poses, which were read from ``path``, do not increase.
@@ -71,7 +65,7 @@ def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, 
         )
     before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
     gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
-    T_near = interpolated_poses(T_any_camera, known, stamps)
+    T_near = se3.interpolate(T_any_camera, known, stamps)
     T_near[gap > _MAX_GAP_S] = np.nan
     describe_unknown(T_near, path)
     return T_near

@@ -19,6 +19,7 @@ from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.common.readers.scan import read_velodyne
+from slam.formats.rows import BadRows, number_or_nan
 from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, sequence_errors
@@ -238,18 +239,17 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
         SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
     """
     try:
-        rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
-        wide = next((number for number, row in enumerate(rows, 1) if len(row) > 1), None)
-        if wide is not None:
-            raise ValueError(f"row {wide} holds {len(rows[wide - 1])} words")
-        stamps = np.array([float(word) for (word,) in rows])
+        words = [line.strip() for line in read_text(path).splitlines() if line.strip()]
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
+    stamps = np.array([number_or_nan(word) for word in words])
     return require_stamps(stamps, path, files)
 
 
 def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> FloatArray:
     """Stamps in seconds read from a file, one for each row of the numbered files it belongs to ``(len(files),)``.
+
+    Bad ones are interpolated between their neighbours (`slam.formats.rows`).
 
     Args:
         stamps: one for each number from 0, one for each row, or one for each file; then those of missing files are
@@ -258,7 +258,7 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
         files: images, or packets of a GPS/INS.
 
     Raises:
-        SequenceError: if their number matches none of these, one is not finite, or they do not increase.
+        SequenceError: if their number matches none of these, or their order is ambiguous.
     """
     assigned = files.rows_of(len(stamps))
     if assigned is None:
@@ -266,14 +266,27 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
             f"{path} has {len(stamps)} rows for {len(files.paths)} images: it needs one stamp an image; "
             f"restore the missing images or cut the file to match"
         )
-    if not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
-        row = int(np.argmin(np.r_[True, np.diff(stamps) > 0] & np.isfinite(stamps))) + 1
-        raise SequenceError(f"{path} row {row}: stamps must be numbers that increase; correct the row")
+    stamps = _mended_stamps(stamps, path)
     rows, skipped = assigned
     if len(rows) == len(files):
         return stamps[skipped:]
     spread: FloatArray = np.interp(np.arange(len(files)), rows, stamps)
     return spread
+
+
+def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
+    bad, rows = BadRows(path, SequenceError), np.arange(1, len(stamps) + 1)
+    good = np.isfinite(stamps)
+    (known,) = bad.without(good, "not a time in seconds", rows)
+    good[good] = bad.in_order(stamps[good], "stamps", known)
+    bad.say(int(good.sum()) if good.sum() > 1 else 0, "times in seconds that increase, one a row")
+    if len(bad):
+        known, times = rows[good], stamps[good]
+        period = float(np.median(np.diff(times) / np.diff(known)))
+        reach = np.array([-len(rows), len(rows)])  # at both ends the rate goes on
+        times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
+        stamps = np.interp(rows, np.r_[known[0] + reach[0], known, known[-1] + reach[1]], times)
+    return stamps
 
 
 def scans_in(folder: Path, files: NumberedFiles) -> dict[int, ScanReader]:

@@ -25,18 +25,18 @@ def take_truth(recording: object, path: Path) -> None:
     if not isinstance(recording, RecordedSequence):
         raise SequenceError(f"the loader of this recording takes no true poses: leave out --truth {path}")
     truth, frames = read_trajectory(path), len(recording)
-    numbers = truth.stamps if truth.numbered else np.arange(len(truth))
+    numbers = truth.frame_numbers
     if truth.timed:
         T_any_camera = poses_near(truth.T_world_camera, truth.stamps, recording.stamps, path)
-    elif truth.numbered or len(truth) == frames:
+    elif truth.numbered or truth.frame_count == frames:
         T_any_camera = np.full((frames, 4, 4), np.nan)
         of_frame = (numbers >= 0) & (numbers < frames)
-        T_any_camera[numbers[of_frame].astype(np.intp)] = truth.T_world_camera[of_frame]
+        T_any_camera[numbers[of_frame]] = truth.T_world_camera[of_frame]
         describe_unknown(T_any_camera, path)
     else:
         raise SequenceError(
-            f"--truth {path} has {len(truth)} rows and the recording {frames} frames: give each frame a row, or rows "
-            "with stamps (TUM)"
+            f"--truth {path} has {truth.frame_count} rows and the recording {frames} frames: give each frame a row, "
+            "or rows with stamps (TUM)"
         )
     if not known_poses(T_any_camera).any():
         its, ours = (f"{numbers[0]:.3f} to {numbers[-1]:.3f}" for numbers in (truth.stamps, recording.stamps))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
-from erfsfm.common.readers.numbering import NumberedFiles
+from erfsfm.common.readers.numbering import by_table
+from slam.formats.rows import BadRows, number_or_nan
 from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -20,7 +22,7 @@ from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near
-from slam.sequences.recording import RecordedSequence, Source, require_stamps
+from slam.sequences.recording import RecordedSequence, Source
 
 INDEX_FILE = "rgb.txt"
 _DEPTH_INDEX = "depth.txt"
@@ -44,15 +46,17 @@ _PUBLISHED = {
 
 
 def open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
-    """Open a TUM folder; poses of the ground truth are interpolated.
+    """Open a TUM folder; poses of the ground truth are interpolated, and rows without an image are gaps in time.
 
     Without a ``camera.yaml``, sequences of the benchmark have the published camera by the name of their folder.
 
     Raises:
-        SequenceError: if ``rgb.txt`` is malformed or names images that are missing.
+        SequenceError, DataError: if ``rgb.txt`` has no good row, or none of its images is there.
     """
-    stamps, paths = _read_index(folder / INDEX_FILE)
-    files = NumberedFiles(tuple(paths), tuple(range(len(paths))))
+    table = folder / INDEX_FILE
+    stamps, paths = _read_index(table)
+    files = by_table(paths, table)
+    stamps = stamps[files.first :][: len(files)]
     stored = ImageFiles(files)
     camera = _camera(folder, stored, asked)
     name = folder.absolute().name
@@ -60,7 +64,7 @@ def open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
         name=name,
         images=stored,
         camera=camera,
-        stamps=require_stamps(stamps, folder / INDEX_FILE, files),
+        stamps=stamps,
         sources=(Source(f"tum/{name}"),),
         T_any_camera=_true_poses(folder / "groundtruth.txt", stamps),
         depth_maps=_depth_maps(folder, stamps),
@@ -76,24 +80,23 @@ def _camera(folder: Path, images: ImageFiles, asked: Path | None) -> CameraFile:
 
 
 def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
-    """Stamps and image paths of ``rgb.txt`` or ``depth.txt``."""
-    stamps, paths = [], []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
-        words = line.split()
+    """Stamps and paths of ``rgb.txt`` or ``depth.txt``, without bad rows."""
+    bad = BadRows(path, SequenceError)
+    rows = []
+    for line, text in enumerate(_text(path).splitlines(), start=1):
+        words = text.split()
         if not words or words[0].startswith("#"):
             continue
-        try:
-            stamp, name = words
-            stamps.append(float(stamp))
-        except ValueError:
-            raise SequenceError(f"{path} line {number} is not 'stamp file': {line!r}; correct it") from None
-        paths.append(path.parent / name)
-    if not paths:
-        raise SequenceError(f"{path} names no images: it needs rows of 'stamp file'")
-    missing = next((p for p in paths if not p.is_file()), None)
-    if missing is not None:
-        raise SequenceError(f"no image {missing}, which {path} names: restore it or remove the row")
-    return np.array(stamps), paths
+        if len(words) == 2 and math.isfinite(number_or_nan(words[0])):
+            rows.append((line, float(words[0]), path.parent / words[1]))
+        else:
+            bad.add(line, f"{text!r} is not 'stamp file'")
+    if path.name == _DEPTH_INDEX:
+        rows.sort(key=lambda row: row[1])  # it is looked up by time alone
+    stamps = np.array([stamp for _, stamp, _ in rows])
+    good = bad.in_order(stamps, "stamps", np.array([line for line, _, _ in rows], np.intp))
+    bad.say(int(good.sum()), "rows of 'stamp file'")
+    return stamps[good], [rows[k][2] for k in np.flatnonzero(good)]
 
 
 def _text(path: Path) -> str:
@@ -107,11 +110,10 @@ def _depth_maps(folder: Path, stamps: FloatArray) -> DepthMaps | None:
     """The registered depth maps of ``depth.txt`` whose stamps are within 20 ms of an image's."""
     if not (folder / _DEPTH_INDEX).exists():
         return None
-    unordered, paths = _read_index(folder / _DEPTH_INDEX)
-    known, rows = np.unique(unordered, return_index=True)
+    known, paths = _read_index(folder / _DEPTH_INDEX)
     nearest = nearest_stamps(stamps, known)
     close = np.abs(known[nearest] - stamps) <= _MAX_DEPTH_DELAY_S
-    return DepthMaps({int(k): paths[rows[nearest[k]]] for k in np.flatnonzero(close)}, _DEPTH_PER_METRE)
+    return DepthMaps({int(k): paths[nearest[k]] for k in np.flatnonzero(close)}, _DEPTH_PER_METRE)
 
 
 def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:

@@ -11,12 +11,14 @@ from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import has_images, list_images
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
+from slam.formats.rows import number_or_nan
+from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import poses_near, poses_of
+from slam.sequences.poses import poses_near
 from slam.sequences.recording import RecordedSequence, Source, require_stamps
 
 _CAMERA, _TIMES, _TRUTH = "camera.txt", "times.txt", "groundtruthSync.txt"
@@ -68,10 +70,10 @@ def _camera(path: Path, fps: float) -> CameraFile:
 def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
     """Rows of number, seconds and perhaps exposure."""
     try:
-        rows = [line.split() for line in read_text(path).splitlines()]
-        stamps = np.array([float(row[1]) for row in rows if row])
-    except (OSError, UnicodeDecodeError, ValueError, IndexError) as error:
+        rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"{path} needs rows of number, seconds and exposure: {error}") from error
+    stamps = np.array([number_or_nan(row[1]) if len(row) > 1 else np.nan for row in rows])
     return require_stamps(stamps, path, files)
 
 
@@ -79,13 +81,8 @@ def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps, NaN where unknown; None without the file."""
     if not path.exists():
         return None
-    try:
-        rows = np.array([line.split() for line in read_text(path).splitlines() if line], np.float64)
-        rows = rows.reshape(len(rows), 8)[np.isfinite(rows).all(axis=1)]
-        T_known = poses_of(rows[:, 1:4], rows[:, 4:])
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise SequenceError(f"{path} needs rows of stamp, position and quaternion: {error}") from error
-    return poses_near(T_known, rows[:, 0], stamps, path)
+    truth = read_trajectory(path, "tum")
+    return poses_near(truth.T_world_camera, truth.stamps, stamps, path)
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:

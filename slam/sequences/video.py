@@ -43,7 +43,10 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
 def _stamps(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
     """The video's own frame times; at the camera's rate where those agree, are of another rate or unknown."""
     even, times_s = uniform_stamps(len(frames), fps), frames.times_s()
-    if frames.fps is not None and abs(frames.fps / fps - 1) > _RATE_TOLERANCE:
+    rates = [frames.fps] if frames.fps else []
+    if rates and times_s is not None and len(times_s) > 1:
+        rates.append(1.0 / float(np.median(np.diff(times_s))))  # missing frames lower the mean rate alone
+    if rates and all(abs(rate / fps - 1) > _RATE_TOLERANCE for rate in rates):
         logger.warning(
             "%s has %.4g frames a second, the camera has %g: taken as even at the camera's rate; correct fps, unless "
             "the video plays faster or slower than it was taken",

@@ -31,7 +31,7 @@ from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SlamError
 from slam.sequences.camera_file import DEFAULT_FPS
-from slam.sequences.ros.messages import camera_file_of, image_of
+from slam.sequences.ros.messages import camera_file_of, image_of, is_rectified
 from slam.sequences.undistortion import Undistortion
 
 T_MAP_WORLD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # without a base
@@ -89,8 +89,8 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
     def begin(self, info: CameraInfo) -> None:
         """Take the calibration; of ``image_rect...`` that of the rectified camera."""
         if self._slam is None:
-            is_rectified = self.resolve_topic_name("image").rpartition("/")[2].startswith("image_rect")
-            camera = camera_file_of(info, is_rectified, DEFAULT_FPS, "camera_info")
+            rectified = is_rectified(self.resolve_topic_name("image"))
+            camera = camera_file_of(info, rectified, DEFAULT_FPS, "camera_info")
             self._undistortion = None if camera.model == "pinhole" else Undistortion(camera)
             intrinsics = self._undistortion.intrinsics if self._undistortion else Intrinsics.of(camera.pinhole)
             config = load_config(None, ["output.keep=keyframes", *self._of["settings"].split()])

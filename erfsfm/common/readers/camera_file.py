@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -95,8 +96,10 @@ class CameraFile(BaseModel):
         return None if isinstance(self.camera_height_m, str) else self.camera_height_m
 
 
-def read_camera_file(path: Path) -> CameraFile:
+def read_camera_file(path: Path, own: Mapping[str, Any] | None = None) -> CameraFile:
     """Read and check a ``camera.yaml``; an unlikely camera is logged as a warning.
+
+    Keys that it lacks are those of the recording's ``own`` camera, if any.
 
     Raises:
         DataError: naming the file and the key that is missing, unknown, written twice or wrong.
@@ -108,7 +111,7 @@ def read_camera_file(path: Path) -> CameraFile:
     if not isinstance(content, dict):
         keys = ", ".join(name for name, item in CameraFile.model_fields.items() if item.is_required())
         raise DataError(f"{path} holds no keys: a camera file needs {keys}")
-    return camera_of(content, str(path))
+    return camera_of({**(own or {}), **content}, str(path))
 
 
 def camera_of(keys: dict[str, Any], where: str) -> CameraFile:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -24,7 +25,9 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _JPEG_SEGMENT = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)  # begins one with a length, or is the end
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
-_TWELVE_BITS = 4096
+_ENDS_PERCENT = (0.1, 99.9)  # of the values: what is beyond is black or white
+_WIDE = 32768  # range of values from which on the upper eight bits show enough
+_STRETCHED_BY = 16  # images of a recording
 _COMPARED_IMAGES = 3
 _NUMBER = re.compile(r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)")  # a stamp such as 1700000000.5 is one number
 
@@ -63,38 +66,68 @@ def natural_key(path: Path) -> list[tuple[Decimal, str]]:
     return [(Decimal(part if place % 2 else 0), part) for place, part in texts_and_numbers]
 
 
-def read_image(path: Path) -> Image:
+@dataclass(frozen=True)
+class Stretch:
+    """How 16-bit values become eight bits: ``low`` black, ``high`` white, linearly; one for all images of a recording.
+
+    Thermal cameras and sensors of 12 bits fill a part of the range, and how much differs from image to image: each
+    stretched by itself would flicker.
+    """
+
+    low: float = 0.0
+    high: float = 65535.0
+
+    @classmethod
+    def of(cls, images: Iterable[NDArray[np.uint16]]) -> Self:
+        """The range of values of some images ``(H, W)`` or ``(H, W, C)``; the whole one where they fill half of it."""
+        ends = [np.percentile(np.atleast_3d(values)[..., :3], _ENDS_PERCENT) for values in images]
+        low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
+        return cls() if high - low > _WIDE or high == low else cls(float(low), float(high))
+
+    def apply(self, values: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """The values of the same shape."""
+        if self == Stretch():
+            return (values >> 8).astype(np.uint8)
+        scaled = (values.astype(np.float32) - self.low) * (255.0 / (self.high - self.low))
+        return np.asarray(np.clip(np.rint(scaled), 0, 255), np.uint8)
+
+
+def stretch_of(paths: Sequence[Path]) -> Stretch | None:
+    """The stretch of a recording's image files, by some of them; None where they have eight bits."""
+    seen = []
+    for path in paths[:: max(len(paths) // _STRETCHED_BY, 1)]:
+        with suppress(DataError):
+            values = read_values(path)
+            if values.dtype != np.uint16:
+                return None
+            seen.append(values)
+    return Stretch.of(seen) if seen else None
+
+
+def read_image(path: Path, stretch: Stretch | None = None) -> Image:
     """Read an image as ``(H, W, 3)`` uint8 RGB; grey is repeated to three channels.
 
-    16-bit images keep their upper eight bits. Where all their values lie under 4096 they are refused: cameras of 12
-    bits are often stored so, and the upper eight bits of that are nearly black.
+    Values of 16 bits are stretched; without a ``stretch`` by their own range.
 
     Raises:
-        DataError: missing, empty, truncated, no image, or 12-bit data in 16 bits; one line.
+        DataError: missing, empty, truncated or no image; one line.
     """
-    return decode_image(_file_bytes(path), f"image {path}")
+    return decode_image(_file_bytes(path), f"image {path}", stretch)
 
 
-def decode_image(data: bytes, where: str) -> Image:
+def decode_image(data: bytes, where: str, stretch: Stretch | None = None) -> Image:
     """As `read_image`, of the bytes of a file; ``where`` they come from is for messages.
 
     Raises:
-        DataError: empty, truncated, no image, or 12-bit data in 16 bits; one line.
+        DataError: empty, truncated or no image; one line.
     """
     _require_complete(data, where)
     if data.startswith(_PNG_START) and data[_PNG_BIT_DEPTH] == 16:
-        _require_sixteen_bits(_decode(where, data, cv2.IMREAD_UNCHANGED), where)
+        values = _decode(where, data, cv2.IMREAD_UNCHANGED)
+        grey_or_colour = np.atleast_3d(values)[..., :3]  # without alpha
+        picture = (stretch or Stretch.of([values])).apply(grey_or_colour)
+        return np.ascontiguousarray(np.broadcast_to(picture[..., ::-1], (*values.shape[:2], 3)))
     return np.asarray(cv2.cvtColor(_decode(where, data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
-def eight_bits(values: NDArray[np.uint16], where: str) -> NDArray[np.uint8]:
-    """The upper eight bits of 16-bit values.
-
-    Raises:
-        DataError: they look like 12-bit data; one line.
-    """
-    _require_sixteen_bits(values, where)
-    return (values >> 8).astype(np.uint8)
 
 
 def read_values(path: Path) -> NDArray[Any]:
@@ -165,15 +198,6 @@ def _require_complete(data: bytes, where: str) -> None:
         raise DataError(f"{where} is empty: copy it again")
     if not _is_complete(data):
         raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
-
-
-def _require_sixteen_bits(values: NDArray[Any], where: str) -> None:
-    most = int(np.atleast_3d(values)[..., :3].max())  # alpha is full where values are dark
-    if 0 < most < _TWELVE_BITS:
-        raise DataError(
-            f"{where} has 16 bits, but no value above {most}: it looks like 12-bit data, nearly black as "
-            f"8 bits; convert the images to 8 bits, or multiply their values by 16"
-        )
 
 
 def _is_complete(data: bytes) -> bool:

@@ -21,11 +21,10 @@ from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, explicit_camera
+from slam.sequences.camera_file import explicit_camera, mount_beside
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
     RecordedSequence,
     Source,
@@ -56,10 +55,10 @@ def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Re
     simulated = root.simulation_seed()
     camera: CameraFile | Intrinsics
     if asked is None:
-        found, height_m = beside(root.base), CAMERA_HEIGHT_M if simulated is None else None
-        camera = Intrinsics.of(calibration.pinhole(f"P{number}", stored.width, stored.height))
-        if found is not None:
-            camera, height_m = replace(camera, readout_s=found.readout_ms / 1e3), found.height_or(height_m)
+        pinhole = calibration.pinhole(f"P{number}", stored.width, stored.height)
+        usual_m = CAMERA_HEIGHT_M if simulated is None else None
+        height_m, readout_s = mount_beside(pinhole, usual_m, root.base)
+        camera = replace(Intrinsics.of(pinhole), readout_s=readout_s)
     else:
         camera, height_m = explicit_camera(asked, stored), CAMERA_HEIGHT_M
     return RecordedSequence(
@@ -94,17 +93,19 @@ def _true_poses(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_c
     """Poses of the camera in use from poses of camera 0; None where the root has no poses."""
     if not path.exists():
         return None
-    T_world_cam0 = read_trajectory(path, format="kitti").T_world_camera
-    assigned = files.rows_of(len(T_world_cam0))
+    found = read_trajectory(path, format="kitti")
+    assigned = files.rows_of(found.frame_count)
     if assigned is None:
         raise SequenceError(
-            f"{path} has {len(T_world_cam0)} poses for {len(files.paths)} images: restore the missing images, or cut "
+            f"{path} has {found.frame_count} poses for {len(files.paths)} images: restore the missing images, or cut "
             f"the poses to match, or remove the file to run without a reference"
         )
     rows, skipped = assigned
+    T_world_cam0 = np.full((found.frame_count, 4, 4), np.nan)
+    T_world_cam0[found.frame_numbers] = found.T_world_camera
     T_world_camera = T_world_cam0[skipped:] @ se3.invert(T_camera_cam0)
     if len(rows) < len(files):
-        T_world_camera = interpolated_poses(T_world_camera, stamps[rows], stamps)
+        T_world_camera = se3.interpolate(T_world_camera, stamps[rows], stamps)
     return T_world_camera
 
 

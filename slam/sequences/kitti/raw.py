@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -25,12 +26,11 @@ from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import explicit_camera, height_beside
+from slam.sequences.camera_file import explicit_camera, mount_beside
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti import oxts
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
     RecordedSequence,
     Source,
@@ -61,8 +61,9 @@ def open_kitti_raw(drive: Path, asked: Path | None) -> RecordedSequence:
     files = by_number(list_images(drive / f"image_{number}" / "data"))
     stored = ImageFiles(files)
     cameras = CalibrationFile(drive.parent / CAM_TO_CAM)
-    camera: CameraFile | Intrinsics = Intrinsics.of(cameras.rectified_pinhole(number, stored.width, stored.height))
-    height_m = height_beside(CAMERA_HEIGHT_M, drive, drive.parent, drive.parent.parent)
+    pinhole = cameras.rectified_pinhole(number, stored.width, stored.height)
+    height_m, readout_s = mount_beside(pinhole, CAMERA_HEIGHT_M, drive, drive.parent, drive.parent.parent)
+    camera: CameraFile | Intrinsics = replace(Intrinsics.of(pinhole), readout_s=readout_s)
     if asked is not None:
         camera, height_m = explicit_camera(asked, stored), CAMERA_HEIGHT_M
     times_path = drive / f"image_{number}" / "timestamps.txt"
@@ -148,7 +149,7 @@ def _true_poses(
     T_camera_imu = T_camera_lidar @ CalibrationFile(path).transform("R", "T")
     T_world_camera = oxts.T_world_imu(content, ages_s) @ se3.invert(T_camera_imu)
     if len(known) < len(files):
-        T_world_camera = interpolated_poses(T_world_camera, stamps[known], stamps)
+        T_world_camera = se3.interpolate(T_world_camera, stamps[known], stamps)
     return T_world_camera
 
 

@@ -6,15 +6,17 @@ import functools
 import logging
 import re
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
-from erfsfm.common.readers.images import first_usual
+from erfsfm.common.readers.images import Stretch, first_usual
+from slam.formats.rows import BadRows
 from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
@@ -29,20 +31,31 @@ from slam.sequences.ros.messages import (
     COMPRESSED_IMAGE,
     IMAGE,
     POINT_CLOUD,
+    SIXTEEN_BITS,
     camera_file_of,
     image_of,
-    is_colour,
+    is_rectified,
     points_of,
+    shows_pictures,
+    values_of,
 )
-from slam.sequences.ros.transforms import StaticTransforms, transform_of
+from slam.sequences.ros.transforms import StaticTransforms, moving_frames, transform_of
 
 logger = logging.getLogger(__name__)
 
-_ODOMETRY, _TRANSFORM = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"
+_POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TransformStamped",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+_FIX = "sensor_msgs/msg/NavSatFix"
 _TRUTH = re.compile(r"ground_?truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack", re.IGNORECASE)
 _CACHED_FRAMES = 32
+_MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
 _SKIPPED_FRAMES = 30
+_STRETCHED_BY = 16  # images
 _SCAN_DELAY_S = 0.05
 _NANOSECONDS = 10**9
 
@@ -50,8 +63,8 @@ _NANOSECONDS = 10**9
 class StampedMessages:
     """The messages of a topic whose first field is a header, in the order of their stamps, read one at a time.
 
-    All messages are read once for their stamps. Where no header has a stamp, the times of recording are used; of
-    messages with one stamp the first is kept.
+    All messages are read once for their stamps. Where no header has a stamp, or their clock was set back, the times of
+    recording are used; of messages with one stamp the first is kept.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
@@ -67,6 +80,15 @@ class StampedMessages:
         self._times_ns = [time_ns for time_ns, _ in pairs]
         stamps_ns = [stamp_ns for _, stamp_ns in pairs] if any(stamp for _, stamp in pairs) else self._times_ns
         numbers = sorted(range(len(pairs)), key=lambda number: stamps_ns[number])
+        if max(abs(number - place) for place, number in enumerate(numbers)) > _MOST_OUT_OF_PLACE:
+            steps = np.diff(stamps_ns)
+            logger.warning(
+                "%s: the stamps of its headers go back by %.2f s at message %d: the times of recording are used",
+                topic,
+                -steps.min() / _NANOSECONDS,
+                int(steps.argmin()) + 1,
+            )
+            stamps_ns, numbers = self._times_ns, list(range(len(pairs)))
         self._numbers = [n for k, n in enumerate(numbers) if not k or stamps_ns[n] > stamps_ns[numbers[k - 1]]]
         if len(self._numbers) < len(pairs):
             logger.warning("%s: %d messages repeat a stamp: left out", topic, len(pairs) - len(self._numbers))
@@ -109,6 +131,7 @@ class BagImages:
         """
         self.messages = StampedMessages(bag, topic)
         self._where = f"an image of {topic} in {bag.path}"
+        self._stretch = self._common_stretch()
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
         self.height, self.width = first_usual(range(len(self))[:_SOUGHT_IMAGES], self._cached)[1].shape[:2]
 
@@ -129,7 +152,18 @@ class BagImages:
         return image.copy()
 
     def _decode(self, index: int) -> Image:
-        return image_of(self.messages.read(index), self._where)
+        return image_of(self.messages.read(index), self._where, self._stretch)
+
+    def _common_stretch(self) -> Stretch | None:
+        """By some images; None where they have eight bits, or are compressed."""
+        seen: list[NDArray[np.uint16]] = []
+        for index in range(0, len(self), max(len(self) // _STRETCHED_BY, 1)):
+            message = self.messages.read(index)
+            if getattr(message, "encoding", "") not in SIXTEEN_BITS:
+                return None
+            with suppress(SequenceError):
+                seen.append(values_of(message, self._where))
+        return Stretch.of(seen) if seen else None
 
 
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
@@ -142,7 +176,8 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     stored = BagImages(bag, topic)
     stamps = stored.messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-    camera = own_camera(partial(_calibration, bag, topic, fps), asked, stored, path.absolute().parent)
+    calibration = partial(_calibration, bag, topic, fps, (stored.width, stored.height))
+    camera = own_camera(calibration, asked, stored, path.absolute().parent)
     mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
     T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)
     return RecordedSequence(
@@ -158,44 +193,71 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
 
 
 def camera_topics(path: Path) -> list[str]:
-    """Topics of a bag with pictures of a camera, without depth.
+    """Topics of a bag with pictures of a camera, without depth; rectified ones in place of the same camera's raw ones.
 
     Raises:
         SequenceError: the bag is damaged.
     """
     with closing(Bag(path)) as bag:
-        return [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if is_colour(bag.first(topic))]
+        topics = [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if shows_pictures(bag.first(topic), topic)]
+    rectified = {_home(topic) for topic in topics if is_rectified(topic)}
+    return [topic for topic in topics if is_rectified(topic) or _home(topic) not in rectified]
 
 
-def _calibration(bag: Bag, topic: str, fps: float) -> CameraFile:
+def _calibration(bag: Bag, topic: str, fps: float, size: tuple[int, int]) -> CameraFile:
     """By the ``camera_info`` beside the images."""
     known = bag.topics(CAMERA_INFO)
-    base = topic.removesuffix("/compressed")
-    home = base.rpartition("/")[0]
+    base, home = topic.removesuffix("/compressed"), _home(topic)
     info = next((name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None)
     if info is None:
         raise SequenceError(
             f"no {home}/camera_info for {topic} in {bag.path}: it has {', '.join(known) or 'no camera_info'}; give "
             f"--camera"
         )
-    is_rectified = base.rpartition("/")[2].startswith("image_rect")
-    return camera_file_of(bag.first(info), is_rectified, fps, f"{info} in {bag.path}")
+    return camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
+
+
+def _home(topic: str) -> str:
+    """The namespace of a camera."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
 def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray) -> FloatArray | None:
-    """``T_any_camera`` at the images' stamps from a topic that is named as truth, NaN where unknown; None without."""
-    topics = [topic for topic in bag.topics(_ODOMETRY, _TRANSFORM) if _TRUTH.search(topic)]
-    for topic in topics:
-        body = bag.first(topic).child_frame_id
-        T_body_camera = mounted.between(body, camera)
+    """``T_any_camera`` at the images' stamps from a topic or frame that is named as truth, NaN where unknown."""
+    topics = bag.topics(*_POSES)
+    for topic in filter(_TRUTH.search, topics):
+        body = getattr(bag.first(topic), "child_frame_id", None)
+        T_body_camera = np.eye(4) if body is None else mounted.between(body, camera)
         if T_body_camera is None:
             logger.warning("%s is not used: no static transform from its %r to the camera's %r", topic, body, camera)
             continue
-        found = StampedMessages(bag, topic)
-        messages = (found.read(k) for k in range(len(found)))
-        T_any_body = np.stack([transform_of(m.pose.pose if hasattr(m, "pose") else m.transform) for m in messages])
-        return poses_near(T_any_body @ T_body_camera, found.stamps, stamps, bag.path)
+        if body is None:
+            logger.warning("%s does not say whose poses it has: they are taken for the camera's", topic)
+        known, T_any_body = _poses(StampedMessages(bag, topic))
+        return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
+    for (parent, body), (known, T_any_body) in moving_frames(bag).items():
+        T_body_camera = mounted.between(body, camera)
+        if T_body_camera is not None and _TRUTH.search(parent):
+            return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
+    for topic in (*topics, *bag.topics(_FIX)):
+        logger.warning("%s (%s) is not used: its name does not say that it is the truth", topic, bag.types[topic])
     return None
+
+
+def _poses(messages: StampedMessages) -> tuple[FloatArray, FloatArray]:
+    """Stamps ``(M,)`` and poses ``(M, 4, 4)`` of the good messages of a topic."""
+    bad, good, T_any_body = BadRows(f"topic {messages.topic}", SequenceError), [], []
+    for number in range(len(messages)):
+        message = messages.read(number)
+        while hasattr(message, "pose"):  # with covariance, and with a header
+            message = message.pose
+        try:
+            T_any_body.append(transform_of(getattr(message, "transform", message)))
+            good.append(number)
+        except ValueError as error:
+            bad.add(number, str(error))
+    bad.say(len(good), "a pose a message")
+    return messages.stamps[good], np.stack(T_any_body)
 
 
 def _scans(

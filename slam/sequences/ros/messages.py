@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
-from erfsfm.common.readers.images import decode_image, eight_bits
+from erfsfm.common.readers.images import Stretch, decode_image
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -27,6 +27,7 @@ _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenC
     "mono8": (1, cv2.COLOR_GRAY2RGB),
     "8UC1": (1, cv2.COLOR_GRAY2RGB),
     "mono16": (1, cv2.COLOR_GRAY2RGB),
+    "16UC1": (1, cv2.COLOR_GRAY2RGB),
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
@@ -34,6 +35,7 @@ _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenC
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
+SIXTEEN_BITS = ("mono16", "16UC1")
 _MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
     "": "pinhole",
     "none": "pinhole",
@@ -45,26 +47,25 @@ _MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
 _FLOAT32 = 7  # PointField.FLOAT32
 
 
-def is_colour(message: Any) -> bool:
-    """Whether an image or compressed image shows what a camera sees, not depth."""
+def shows_pictures(message: Any, topic: str) -> bool:
+    """Whether an image or compressed image of a topic shows what a camera sees, not depth."""
     if hasattr(message, "encoding"):
-        return message.encoding in _CONVERSIONS
+        is_depth = message.encoding == "16UC1" and "depth" in topic.lower()
+        return message.encoding in _CONVERSIONS and not is_depth
     return "compressedDepth" not in message.format
 
 
-def image_of(message: Any, where: str) -> Image:
-    """The picture ``(H, W, 3)`` uint8 RGB of an ``Image`` or a ``CompressedImage``.
+def values_of(message: Any, where: str) -> NDArray[Any]:
+    """The values ``(H, W, C)`` of an ``Image`` as stored.
 
     Raises:
-        SequenceError, DataError: an encoding that is not known, or too few bytes.
+        SequenceError: an encoding that is not known, or too few bytes.
     """
-    if hasattr(message, "format"):
-        return decode_image(bytes(message.data), where)
     encoding = message.encoding
     if encoding not in _CONVERSIONS:
         raise SequenceError(f"{where} has encoding {encoding}; known are {', '.join(_CONVERSIONS)}")
-    channels, conversion = _CONVERSIONS[encoding]
-    sample = np.dtype(np.uint16 if encoding == "mono16" else np.uint8).newbyteorder(
+    channels, _ = _CONVERSIONS[encoding]
+    sample = np.dtype(np.uint16 if encoding in SIXTEEN_BITS else np.uint8).newbyteorder(
         ">" if message.is_bigendian else "<"
     )
     height, width, step = message.height, message.width, message.step
@@ -73,30 +74,62 @@ def image_of(message: Any, where: str) -> Image:
     if not 0 < row <= step or len(data) < height * step:
         raise SequenceError(f"{where} has {len(data)} bytes for {width}x{height} pixels of {encoding}")
     values = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row]).view(sample)
-    if encoding == "mono16":
-        values = eight_bits(values.astype(np.uint16), where)
-    picture = values.reshape(height, width, channels)
+    return values.reshape(height, width, channels).astype(sample.newbyteorder("="))
+
+
+def image_of(message: Any, where: str, stretch: Stretch | None = None) -> Image:
+    """The picture ``(H, W, 3)`` uint8 RGB of an ``Image`` or a ``CompressedImage``.
+
+    Values of 16 bits are stretched; without a ``stretch`` by their own range.
+
+    Raises:
+        SequenceError, DataError: an encoding that is not known, or too few bytes.
+    """
+    if hasattr(message, "format"):
+        return decode_image(bytes(message.data), where, stretch)
+    picture, (_, conversion) = values_of(message, where), _CONVERSIONS[message.encoding]
+    if picture.dtype == np.uint16:
+        picture = (stretch or Stretch.of([picture])).apply(picture)
     return np.array(picture if conversion is None else cv2.cvtColor(picture, conversion), dtype=np.uint8)
 
 
-def camera_file_of(info: Any, is_rectified: bool, fps: float, where: str) -> CameraFile:
-    """The camera of a ``CameraInfo``: K with its distortion, or P of rectified images.
+def camera_file_of(
+    info: Any, rectified: bool, fps: float, where: str, size: tuple[int, int] | None = None
+) -> CameraFile:
+    """The camera of a ``CameraInfo``: K with its distortion, or P of rectified images, of the images as they come.
+
+    The calibration is of the whole sensor; images are its region of interest, binned (REP 104). Some drivers state a
+    binning of images that are whole: those of ``size`` (width, height) as large as the calibration are.
 
     Raises:
         SequenceError, DataError: it was not calibrated, or the model of the lens is unknown.
     """
     K, P, distortion = (getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd")
-    model = "" if is_rectified or not np.any(distortion) else info.distortion_model
+    model = "" if rectified or not np.any(distortion) else info.distortion_model
     if model not in _MODELS:
         known = ", ".join(name for name in _MODELS if name)
         raise SequenceError(f"{where} has distortion_model {model}; known are {known}: give --camera")
-    fx, _, cx, *_ = P if is_rectified else K
-    fy, cy = (P[5], P[6]) if is_rectified else (K[4], K[5])
+    fx, _, cx, *_ = P if rectified else K
+    fy, cy = (P[5], P[6]) if rectified else (K[4], K[5])
     if not (fx > 0 and fy > 0):
         raise SequenceError(f"{where} has no calibration, its focal length is {fx:g}: give --camera")
-    keys = {"width": info.width, "height": info.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
+    width, height, roi = info.width, info.height, info.roi
+    if size != (width, height):
+        binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)
+        if roi.width and roi.height:
+            width, height = roi.width, roi.height
+        width, height = width // binning_x, height // binning_y
+        fx, fy = fx / binning_x, fy / binning_y
+        cx = (cx - roi.x_offset + 0.5) / binning_x - 0.5
+        cy = (cy - roi.y_offset + 0.5) / binning_y - 0.5
+    keys = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
     coefficients = [] if _MODELS[model] == "pinhole" else [float(value) for value in distortion]
     return camera_of({**keys, "model": _MODELS[model], "distortion": coefficients}, where)
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether a topic of images is named as rectified ones are."""
+    return topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
 
 
 def points_of(cloud: Any, where: str) -> FloatArray:

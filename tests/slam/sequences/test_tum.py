@@ -1,9 +1,12 @@
+import logging
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import DataError
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.recording import RecordedSequence
 
@@ -44,6 +47,45 @@ def test_truth_is_interpolated(folder: Path) -> None:
     # 0.03 s after the first image, seen from a camera turned by 0.01 rad
     assert reference[1, :3, 3] == pytest.approx([-0.03 * np.sin(0.01), 0, 0.03 * np.cos(0.01)], abs=1e-6)
     assert reference[1, 0, 2] == pytest.approx(np.sin(0.015), abs=1e-6)
+
+
+def test_uncovered_images_mean_no_reference(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_truth(folder, np.arange(101.0, 102.0, 0.02))
+    with caplog.at_level(logging.WARNING):
+        assert open_sequence(folder, None, None, None).reference is None
+    assert "no pose of image 0" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("# nothing\n", "there is no row"),
+        ("100.0 rgb/100.02.png extra\n", "line 1: .*is not 'stamp file'"),
+        ("soon rgb/100.02.png\n", "line 1: .*is not 'stamp file'"),
+        ("100.0 rgb/gone.png\n", "none of the 1 images"),
+        ("100.2 rgb/100.02.png\n100.1 rgb/100.05.png\n", "line 1: stamps must increase"),
+    ],
+)
+def test_malformed_index(folder: Path, text: str, message: str) -> None:
+    (folder / "rgb.txt").write_text(text)
+    with pytest.raises((SequenceError, DataError), match=message):
+        open_sequence(folder, None, None, None)
+
+
+def test_bad_rows_are_left_out(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    known = open_sequence(folder)
+    index = folder / "rgb.txt"
+    rows = index.read_text().splitlines()
+    index.write_text("\n".join([*rows, rows[-1], "soon rgb/100.02.png"]))
+    again = open_sequence(folder)
+    np.testing.assert_array_equal(again.stamps, known.stamps)
+    assert len(again) == len(known) and "2 of " in caplog.text
+
+
+def test_needs_a_camera_file(folder: Path) -> None:
+    (folder / "camera.yaml").unlink()
+    with pytest.raises(SequenceError, match=r"no camera\.yaml for TUM folder"):
+        open_sequence(folder, None, None, None)
 
 
 @pytest.mark.parametrize("rows", [("100.035 near.png", "100.30 far.png"), ("100.30 far.png", "100.035 near.png")])

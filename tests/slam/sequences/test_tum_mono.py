@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import camera_of
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.undistortion import Undistortion
 
@@ -48,3 +49,17 @@ def test_the_fov_lens_bends_radii_to_angles() -> None:
     stripes[:, 100:] = 255
     flat = lens.apply(stripes)
     assert flat[:, :99].max() == 0 and flat[:, 101:].min() == 255
+
+
+def test_damage(walk: Path) -> None:
+    (walk / "camera.txt").write_text("0.5 0.8\n40 24\n")
+    with pytest.raises(SequenceError, match=r"camera\.txt needs a row of fx fy cx cy"):
+        open_sequence(walk)
+    (walk / "camera.txt").write_text(f"{LENS}\n40 24\n")
+    (walk / "times.txt").write_text("00000 soon\n" * 6)
+    with pytest.raises(SequenceError, match=r"times\.txt, line 1"):
+        open_sequence(walk)
+    for path in (walk / "images").iterdir():
+        path.unlink()
+    with pytest.raises(SequenceError, match=r"unpack images\.zip there"):
+        open_sequence(walk)

@@ -76,6 +76,25 @@ def test_uneven_frame_times_are_used(tmp_path: Path, camera_64: str, caplog: pyt
     assert "has 20.77 frames a second, the camera has 5: taken as even at the camera's rate" in caplog.text
 
 
+def test_missing_frames_do_not_change_the_rate(tmp_path: Path, camera_64: str) -> None:
+    times = [60 * k for k in range(60) if k % 7 and not 30 <= k < 35]
+    path = write_mp4(tmp_path / "drive.mp4", times)
+    (tmp_path / "camera.yaml").write_text(camera_64.replace("fps: 5", "fps: 10"))
+    assert open_sequence(path).stamps == pytest.approx((np.array(times) - times[0]) / 600)
+
+
+def test_even_frames_have_the_rate_of_the_video(
+    tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_mp4(tmp_path / "phone.mp4", [120 * k for k in range(12)])
+    camera = tmp_path / "camera.yaml"
+    for fps, stamps in (("5.02", np.arange(12) / 5.02), ("5.4", np.arange(12) / 5), ("10", np.arange(12) / 10)):
+        assert "frames a second" not in caplog.text
+        camera.write_text(camera_64.replace("fps: 5", f"fps: {fps}"))
+        assert open_sequence(path).stamps == pytest.approx(stamps, abs=1e-9), fps
+    assert "phone.mp4 has 5 frames a second, the camera has 10: taken as even at the camera's rate" in caplog.text
+
+
 def test_a_field_of_view_takes_the_rate_of_the_video(tmp_path: Path) -> None:
     path = write_mp4(tmp_path / "phone.mp4", [24 * k for k in range(8)])
     sequence = open_sequence(path, camera=Path("fov=90"))

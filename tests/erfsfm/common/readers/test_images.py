@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import has_images, image_size, list_images, read_image, read_values, resize_image
+from erfsfm.common.readers.images import (
+    has_images,
+    image_size,
+    list_images,
+    read_image,
+    read_values,
+    resize_image,
+    stretch_of,
+)
 
 
 def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
@@ -33,20 +41,37 @@ def test_grey_and_16_bit_images_become_three_channels(tmp_path: Path, dtype: typ
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_twelve_bits_in_sixteen_are_refused(tmp_path: Path, channels: int) -> None:
+def test_a_part_of_sixteen_bits_is_stretched(tmp_path: Path, channels: int) -> None:
     path = tmp_path / "a.png"
-    values = np.random.default_rng(0).integers(0, 4000, (24, 32, channels)).astype(np.uint16)
-    values[0, 0] = 3999
+    grey = np.random.default_rng(0).integers(0, 256, (240, 320, channels))
+    values = (7000 + grey * (2000 / 255)).astype(np.uint16)
     values[..., 3:] = 65535  # opaque
     cv2.imwrite(str(path), values)
-    with pytest.raises(DataError, match=r"a\.png has 16 bits, but no value above 3999: it looks like 12-bit") as caught:
-        read_image(path)
-    assert "\n" not in str(caught.value)
-    cv2.imwrite(str(path), np.concatenate([16 * values[..., :3], values[..., 3:]], axis=2))
-    assert read_image(path).mean() > 100
+    read = read_image(path)
+    assert np.abs(read[..., ::-1][..., : min(channels, 3)] - grey[..., :3]).max() <= 2
     values[..., :3] = 0
     cv2.imwrite(str(path), values)
     assert read_image(path).max() == 0, "a black image is accepted"
+
+
+def test_one_stretch_serves_a_whole_recording(tmp_path: Path) -> None:
+    """Half of the images are darker, and stay so."""
+    grey = np.random.default_rng(0).integers(0, 256, (24, 32))
+    paths = [tmp_path / f"{k}.png" for k in range(8)]
+    for k, path in enumerate(paths):
+        cv2.imwrite(str(path), (64 * grey * (0.25 if k > 3 else 1)).astype(np.uint16))
+    stretch = stretch_of(paths)
+    light, dark = (read_image(path, stretch)[..., 0].astype(float) for path in (paths[0], paths[7]))
+    np.testing.assert_allclose(light, grey, atol=1.5)
+    np.testing.assert_allclose(dark, grey / 4, atol=1.5)
+    cv2.imwrite(str(paths[0]), grey.astype(np.uint8))
+    assert stretch_of(paths) is None
+
+
+def test_depth_maps_keep_their_values(tmp_path: Path) -> None:
+    depth = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
+    cv2.imwrite(str(tmp_path / "d.png"), depth)
+    np.testing.assert_array_equal(read_values(tmp_path / "d.png"), depth)
 
 
 @pytest.mark.parametrize("read", [read_image, read_values, image_size])

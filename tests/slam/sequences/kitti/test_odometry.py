@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.runtime.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
 from slam.sequences.catalogue import open_sequence
 
 
@@ -86,6 +86,92 @@ def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str) -> None:
     (tmp_path / "simulation.json").write_text("{}")
     with pytest.raises(SequenceError, match="must hold the simulation's seed"):
         open_sequence(tmp_path, None, None, None)
+
+
+def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml: str) -> None:
+    odometry(tmp_path)
+    path = tmp_path / "mine.yaml"
+    path.write_text(camera_yaml.replace("fx: 30", "fx: 33") + "camera_height_m: unknown\n")
+    sequence = open_sequence(tmp_path, "00", path, None)
+    assert sequence.intrinsics.fx == 33 and sequence.camera_height_m is None
+
+
+def broken(folder: Path, base: Path, what: str) -> None:
+    match what:
+        case "unnumbered":
+            (folder / "image_2/000002.png").rename(folder / "image_2/left.png")
+        case "of another size":
+            (folder / "calib.txt").write_text("P2: 45 0 30 0 0 45 18 0 0 0 1 0")
+        case "no calib":
+            (folder / "calib.txt").unlink()
+        case "bad calib":
+            (folder / "calib.txt").write_text("P2: 1 2 3\n")
+        case "short poses":
+            (base / "poses/00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4)
+        case "bad poses":
+            (base / "poses/00.txt").write_text("1 0 0\n" * 6)
+        case "short times":
+            (folder / "times.txt").write_text("0\n0.1\n")
+        case "bad times":
+            (folder / "times.txt").write_text("one\n" * 6)
+        case "every image":
+            for path in (folder / "image_2").iterdir():
+                path.write_bytes(b"")
+        case "no images":
+            for path in (folder / "image_2").iterdir():
+                path.unlink()
+
+
+@pytest.mark.parametrize(
+    "what, message",
+    [
+        ("unnumbered", r"left\.png is not named by its number"),
+        ("of another size", r"principal point \(30, 18\) in row P2 is far .* 40x24 images: .*of different sizes"),
+        ("no calib", r"no calib\.txt in "),
+        ("bad calib", "row P2 has 3 numbers"),
+        ("short poses", r"00\.txt has 4 poses for 6 images: .*cut the poses"),
+        ("bad poses", r"00\.txt"),
+        ("short times", r"times\.txt has 2 rows for 6 images"),
+        ("bad times", r"times\.txt, line 1"),
+        ("every image", r"000000\.png is empty"),
+        ("no images", "looked for png or jpg in .*image_2"),
+    ],
+)
+def test_broken_sequences(tmp_path: Path, odometry, what: str, message: str) -> None:
+    broken(odometry(tmp_path), tmp_path, what)
+    with pytest.raises(SlamError, match=message) as caught:
+        open_sequence(tmp_path, "00", None, None)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("bad", ["1", "soon", "nan"])
+@pytest.mark.parametrize("row", [2, 5])
+def test_a_bad_time_is_interpolated(tmp_path: Path, odometry, bad: str, row: int) -> None:
+    times = [str(k) for k in range(6)]
+    times[row] = bad
+    (odometry(tmp_path) / "times.txt").write_text("\n".join(times))
+    np.testing.assert_allclose(open_sequence(tmp_path, "00", None, None).stamps, np.arange(6), atol=1e-9)
+
+
+def test_a_bad_pose_is_unknown(tmp_path: Path, odometry) -> None:
+    odometry(tmp_path)
+    path = tmp_path / "poses/00.txt"
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join([rows[0], "nan " * 12, *rows[2:5], rows[5][:20]]))
+    poses = open_sequence(tmp_path, "00", None, None).T_any_camera
+    np.testing.assert_array_equal(np.isfinite(poses).all(axis=(1, 2)), [True, False, True, True, True, False])
+
+
+def test_later_damage_is_an_error_when_read(tmp_path: Path, odometry) -> None:
+    folder = odometry(tmp_path)
+    path = folder / "image_2/000004.png"
+    path.write_bytes(path.read_bytes()[:40])
+    sequence = open_sequence(tmp_path, "00", None, None)
+    sequence.frame(3)
+    with pytest.raises(SequenceError, match=r"000004\.png is truncated"):
+        sequence.frame(4)
+    with pytest.raises(SequenceError, match="no frame 6 in sequence 00: it has frames 0 to 5"):
+        sequence.frame(6)
 
 
 @pytest.fixture

@@ -75,19 +75,28 @@ class BagWriter:
         )
         self.write(topic, stamp_ns + late_ns, message)
 
-    def camera_info(self, topic: str, camera: Any, model: str, distortion: tuple[float, ...] = ()) -> None:
+    def camera_info(
+        self,
+        topic: str,
+        camera: Any,
+        model: str,
+        distortion: tuple[float, ...] = (),
+        binning: int = 0,
+        region: tuple[int, int, int, int] = (0, 0, 0, 0),
+    ) -> None:
+        """``region`` is x offset, y offset, width and height of the images on the sensor."""
         K = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
         P = np.insert(K.reshape(3, 3) + np.diag([1, 1, 0]), 3, 0, axis=1).ravel()  # focal lengths 1 pixel longer
         values = {"d": np.array(distortion, np.float64), "k": K, "r": np.eye(3).ravel(), "p": P}
-        roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+        roi = dict(zip(("x_offset", "y_offset", "width", "height"), region)) | {"do_rectify": False}
         message = self.make(
             "sensor_msgs/msg/CameraInfo",
             header=self.header(FIRST_NS, self.camera_frame),
             height=camera.height,
             width=camera.width,
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
+            binning_x=binning,
+            binning_y=binning,
             roi=self.make("sensor_msgs/msg/RegionOfInterest", **roi),
             **{key.upper() if self.is_ros1 else key: value for key, value in values.items()},
         )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 
 from slam.commands.doctor import examine
 from slam.frames import Intrinsics
+from slam.runtime import imports
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_names
 
@@ -73,6 +76,7 @@ def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
         ("yuv422", 2),
         ("yuv422_yuy2", 2),
         ("mono16", 1),
+        ("16UC1", 1),
     ],
 )
 def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: int) -> None:
@@ -81,7 +85,7 @@ def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: i
     pixels = np.full((24, 40, channels), level, np.uint8)
     if channels == 2:
         pixels[:, :, 0 if encoding == "yuv422" else 1] = 128
-    elif encoding == "mono16":
+    elif encoding in ("mono16", "16UC1"):
         pixels = np.full((24, 40), level * 256 + 7, np.uint16)
     bag = new_bag()
     bag.camera_info("/c/camera_info", CAMERA, "", ())
@@ -111,6 +115,50 @@ def test_calibration(new_bag: NewBag, kind: str) -> None:
     assert open_sequence(path, "/bare/image_raw", Path("fov=90")).intrinsics.fx == pytest.approx(20)
 
 
+def test_images_are_a_binned_region_of_the_calibrated_sensor(new_bag: NewBag, kind: str) -> None:
+    """A sensor of 87x60 with its calibration; the images show 80x48 of it, binned to 40x24."""
+    sensor = Intrinsics(87, 60, 60, 60, 44.5, 31.5)
+    bag = new_bag(kind)
+    bag.camera_info("/part/camera_info", sensor, "plumb_bob", (), 2, (4, 7, 81, 48))
+    bag.camera_info("/all/camera_info", replace(sensor, width=40, height=24, cx=20, cy=12), "plumb_bob", (), 2)
+    for topic in ("/part/image_raw", "/all/image_raw"):
+        bag.image(topic, FIRST_NS, picture(0), "mono8")
+    path = bag.close()
+    assert open_sequence(path, "/part/image_raw").intrinsics == CAMERA
+    assert open_sequence(path, "/all/image_raw").intrinsics.fx == 60  # the driver states a binning of whole images
+
+
+def test_rectified_images_stand_for_the_raw_ones_beside_them(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    bag.image("/cam0/image_rect", FIRST_NS, picture(0), "mono8")
+    (name,) = sequence_names(path := bag.close())
+    assert name == "/cam0/image_rect" and open_sequence(path).intrinsics.fx == 31
+
+
+def test_a_clock_that_was_set_back_gives_way_to_the_times_of_recording(
+    new_bag: NewBag, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
+    for k in range(40):
+        early_ns = 21 * STEP_NS if k >= 20 else 0
+        bag.image("/cam0/image_raw", FIRST_NS + k * STEP_NS - early_ns, picture(k), "mono8", late_ns=early_ns)
+    sequence = open_sequence(bag.close())
+    np.testing.assert_allclose(np.diff(sequence.stamps), STEP_NS / 1e9, atol=1e-6)
+    np.testing.assert_array_equal(sequence.frame(21).image[:, :, 0], picture(21))
+    assert "1.00 s at message 20" in caplog.text
+
+
+def test_a_camera_file_beside_a_bag_may_have_the_height_alone(new_bag: NewBag) -> None:
+    bag = new_bag()
+    drive(bag)
+    path = bag.close()
+    (path.parent / "camera.yaml").write_text("camera_height_m: 1.3\n")
+    sequence = open_sequence(path)
+    assert sequence.camera_height_m == 1.3 and sequence.intrinsics == CAMERA
+
+
 def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag, kind: str) -> None:
     """The body moves 1 m along its x a frame; the camera looks along that axis, the LiDAR is 2 m above the camera."""
     bag = new_bag(kind)
@@ -118,6 +166,7 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
     half = 0.5
     bag.mount("body", "camera", bag.transform((0.1, 0, 0), (-half, half, -half, half)))
     bag.mount("camera", "lidar", bag.transform((0, -2, 0)))
+    bag.mount("body", "broken", bag.transform((0, 0, 0), (0, 0, 0, 0)))  # it is left out
     for k in range(-1, FRAMES + 1):
         transform = bag.transform((k, 5, 0))
         bag.write(
@@ -128,6 +177,8 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
     fields = [
         bag.make("sensor_msgs/msg/PointField", name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")
     ]
+    lost = bag.stamped_transform(FIRST_NS + 1, "w", "body", bag.transform((9, 9, 9), (0, 0, 0, 0)))
+    bag.write("/ground_truth", FIRST_NS + 1, lost)
     points = np.array([[1, 2, 3, 0], [np.nan, 0, 0, 0], [4, 5, 6, 0]], np.float32)
     for late_ns, shift in ((9_000_000, 0), (24_000_000, 7)):  # the second is farther from the image
         cloud = bag.make(
@@ -160,6 +211,74 @@ def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
     with pytest.raises(SequenceError, match=r"bag .*walk.* cannot be read") as caught:
         open_sequence(path)
     assert "\n" not in str(caught.value)
+
+
+def test_an_mcap_of_another_program_is_named_with_its_schema_and_encoding(tmp_path: Path) -> None:
+    def record(kind: int, content: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(content)) + content
+
+    def text(words: str) -> bytes:
+        return struct.pack("<I", len(words)) + words.encode()
+
+    magic = b"\x89MCAP0\r\n"
+    start = magic + record(1, text("") + text("test"))
+    schema = record(3, struct.pack("<H", 1) + text("foxglove.RawImage") + text("jsonschema") + text("{}"))
+    channel = record(4, struct.pack("<HH", 1, 1) + text("/cam") + text("json") + struct.pack("<I", 0))
+    footer = record(2, struct.pack("<QQI", len(start), 0, 0))
+    (tmp_path / "walk.mcap").write_bytes(start + schema + channel + footer + magic)
+    with pytest.raises(SequenceError, match=r"not of ROS: it holds /cam \(foxglove.RawImage, json\)"):
+        open_sequence(tmp_path / "walk.mcap")
+
+
+def test_true_poses_of_a_tracker_in_tf(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    bag.mount("rig", "camera", bag.transform((0, 0, 1)))
+    for k in range(-1, FRAMES + 1):
+        each = bag.stamped_transform(FIRST_NS + k * STEP_NS, "vicon/world", "rig", bag.transform((k, 5, 0)))
+        bag.write("/tf", FIRST_NS + k * STEP_NS, bag.make("tf2_msgs/msg/TFMessage", transforms=[each]))
+    reference = open_sequence(bag.close()).reference
+    assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
+
+
+@pytest.mark.parametrize("topic", ["/mocap/pose", "/pose"])
+def test_stamped_poses_are_the_truth_where_their_topic_says_so(
+    new_bag: NewBag, kind: str, topic: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    for k in range(-1, FRAMES + 1):
+        where = bag.transform((k, 5, 0))
+        point = bag.make("geometry_msgs/msg/Point", x=float(k), y=5.0, z=0.0)
+        pose = bag.make("geometry_msgs/msg/Pose", position=point, orientation=where.rotation)
+        stamp = FIRST_NS + k * STEP_NS
+        bag.write(topic, stamp, bag.make("geometry_msgs/msg/PoseStamped", header=bag.header(stamp, "w"), pose=pose))
+    reference = open_sequence(bag.close()).reference
+    if topic == "/pose":
+        assert reference is None and "/pose (geometry_msgs/msg/PoseStamped) is not used" in caplog.text
+    else:
+        assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
+
+
+def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
+    bag.image("/depth/image_raw", FIRST_NS, np.ones((24, 40), np.uint16), "16UC1")
+    path = bag.close()
+    with pytest.raises(SequenceError, match=r"no topic with images of a camera: it holds .*/depth/image_raw \(sensor"):
+        open_sequence(path)
+    assert examine(path)[-1].startswith("missing")
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "walk.bag").write_bytes(b"")
+
+    def absent(name: str) -> None:
+        raise ImportError(f"No module named {name}")
+
+    monkeypatch.setattr(imports.importlib, "import_module", absent)
+    with pytest.raises(SequenceError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
+        open_sequence(tmp_path / "walk.bag")
 
 
 def compressed(new_bag: NewBag, kind: str, count: int, damaged: Collection[int]) -> Path:

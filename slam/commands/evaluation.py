@@ -20,7 +20,7 @@ verbs = typer.Typer()
 @verbs.command()
 def evaluate(
     paths: Annotated[
-        list[str], typer.Argument(help="ESTIMATE REFERENCE (two files), or run folders; with --reference any of both")
+        list[str], typer.Argument(help="ESTIMATE REFERENCE (files or a run), or run folders; with --reference any of both")
     ],
     reference: Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B of the reference, half-open")] = None,
@@ -33,7 +33,7 @@ def evaluate(
 ) -> None:
     """Errors of trajectories or of whole runs.
 
-    Of two trajectory files: all metrics under all alignments. Of run folders: their tables side by side. With
+    Of two trajectories, files or that of a run: all metrics under all alignments. Of run folders: their tables side by side. With
     --reference: one table of any number of files and runs. NAME=PATH names a system; of several with one NAME the table
     has mean and deviation.
 
@@ -114,7 +114,10 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
         typer.echo(metrics.to_json())
     else:
         print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
-        for line in evo_commands(estimate, reference, format):
+        kind = "tum" if all(each.timed for each in whole) else "kitti"
+        names = (estimate, "trajectory_optimised"), (reference, REFERENCE)
+        files = (path / f"{name}.{kind}.txt" if path.is_dir() else path for path, name in names)
+        for line in evo_commands(*files, format):
             typer.echo(line)
     broken = exceeded(metrics, limits)
     if broken:

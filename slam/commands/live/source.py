@@ -21,6 +21,7 @@ from slam.sequences.camera_file import DEFAULT_FPS
 
 _DESCRIBED_STREAMS = (".sdp", ".m3u8")
 _POLL_S = 0.01
+_RETRY_S = 0.2  # until a stream that is not there is tried again
 _WRITING_S = 1.0  # that an image may take to be written
 
 logger = logging.getLogger(__name__)
@@ -123,21 +124,20 @@ class FolderSource:
 class VideoSource:
     """A source that OpenCV opens: a camera's number, a stream's address, or a file, played at its own speed."""
 
-    def __init__(self, name: str) -> None:
-        """Open it.
+    def __init__(self, name: str, wait_s: float) -> None:
+        """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off.
 
         Raises:
             SequenceError: it cannot be opened or gives no image.
         """
-        self._name = name
+        self._name, self._wait_s = name, wait_s
         self.is_stored = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
         if Path(name).is_fifo():  # OpenCV would wait for ever
             raise SequenceError(f"{name} is a pipe: let the camera fill a folder, or give the address of its stream")
-        self._capture: Any = cv2.VideoCapture(int(name) if name.isdecimal() else name)
-        self.fps = float(self.is_stored and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
-        self._first = self._next()
+        self._first = self._opened(Event())
         if self._first is None:
             raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")
+        self.fps = float(self.is_stored and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
         self.height, self.width = self._first.shape[:2]
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
@@ -147,9 +147,24 @@ class VideoSource:
             stamp = count / self.fps if self.is_stored else time.monotonic() - began
             if self.is_stored and stopped.wait(max(began + stamp - time.monotonic(), 0.0)):
                 break
-            yield stamp, image
+            if image.shape[:2] == (self.height, self.width):
+                yield stamp, image
             count, image = count + 1, self._next()
+            if image is None and not self.is_stored and self._capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0:
+                logger.warning("%s broke off after %d images: it is opened again", self._name, count)
+                image = self._opened(stopped)
         self._capture.release()
+
+    def _opened(self, stopped: Event) -> Image | None:
+        """The first image; None where none comes in time."""
+        is_patient = not self.is_stored and (self._name.isdecimal() or "://" in self._name or Path(self._name).exists())
+        deadline = time.monotonic() + (self._wait_s if is_patient else 0.0)
+        while True:
+            self._capture: Any = cv2.VideoCapture(int(self._name) if self._name.isdecimal() else self._name)
+            image = self._next()
+            if image is not None or time.monotonic() > deadline or stopped.wait(_RETRY_S):
+                return image
+            self._capture.release()
 
     def _next(self) -> Image | None:
         read, image = self._capture.read()
@@ -163,4 +178,4 @@ def open_source(camera: str, wait_s: float) -> Source:
         SequenceError: it cannot be opened, or no image comes within ``wait_s``.
     """
     folder = Path(camera)
-    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera)
+    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera, wait_s)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -320,6 +320,48 @@ def test_an_address_gives_images_as_they_arrive(video: Path) -> None:
     assert stamps[-1] < 1e6, "seconds since the first, not since 1970"
 
 
+class Camera(BaseHTTPRequestHandler):
+    """Motion JPEG: six images a connection, each as bright as its number."""
+
+    sent = 0
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=image")
+        self.end_headers()
+        for _ in range(6):
+            _, jpeg = cv2.imencode(".jpg", np.full((24, 32, 3), 20 * Camera.sent, np.uint8))
+            head = f"--image\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+            self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
+            Camera.sent += 1
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_a_camera_that_comes_late_and_breaks_off_is_opened_again() -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Camera) as found:
+        address = found.server_address
+    server = ThreadingHTTPServer(address, Camera, bind_and_activate=False)
+
+    def come() -> None:
+        time.sleep(0.5)
+        server.server_bind()
+        server.server_activate()
+        server.serve_forever()
+
+    Thread(target=come, daemon=True).start()
+    stopped = Event()
+    seen = []
+    for _, image in open_source(f"http://127.0.0.1:{address[1]}/live", 20.0).images(stopped):
+        seen.append(round(float(image.mean()) / 20))
+        if max(seen) >= 8:
+            stopped.set()
+    server.shutdown()
+    server.server_close()
+    assert seen == sorted(seen) and seen[0] == 0 and len(set(seen)) >= 5
+
+
 def test_the_viewer_is_shown_the_drive(
     street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -342,7 +384,7 @@ def test_the_viewer_is_shown_the_drive(
 @pytest.mark.parametrize("suffix", [".avi", ".m4v"])
 def test_a_video_plays_at_its_own_speed(video: Path, suffix: str) -> None:
     video = video.rename(video.with_suffix(suffix))
-    source = VideoSource(str(video))
+    source = VideoSource(str(video), 0.1)
     assert calibration_of(str(video), Path("fov=70"), source).fps == 20.0
     with pytest.raises(SequenceError, match=r"give --camera camera\.yaml or fov=70; no camera\.yaml is in"):
         calibration_of(str(video), None, source)
@@ -386,7 +428,7 @@ def test_the_reader_ends_with_a_run_that_cannot_begin(street: Path, tiny_weights
 
 def test_sources_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="no image comes from"):
-        VideoSource(str(tmp_path / "none.mp4"))
+        VideoSource(str(tmp_path / "none.mp4"), 0.1)
     with pytest.raises(SequenceError, match="no image comes from 99: check the camera"):
         open_source("99", 0.1)
     with pytest.raises(SequenceError, match=r"no image came to .* within 0\.1 s"):

@@ -20,7 +20,7 @@ verbs = typer.Typer()
 @verbs.command()
 def evaluate(
     paths: Annotated[
-        list[str], typer.Argument(help="ESTIMATE REFERENCE (files or a run), or run folders; with --reference any of both")
+        list[str], typer.Argument(help="ESTIMATE REFERENCE (files or a run), or runs; with --reference any of both")
     ],
     reference: Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B of the reference, half-open")] = None,
@@ -33,9 +33,9 @@ def evaluate(
 ) -> None:
     """Errors of trajectories or of whole runs.
 
-    Of two trajectories, files or that of a run: all metrics under all alignments. Of run folders: their tables side by side. With
-    --reference: one table of any number of files and runs. NAME=PATH names a system; of several with one NAME the table
-    has mean and deviation.
+    Of two trajectories, files or that of a run: all metrics under all alignments. Of run folders: their tables side by
+    side. With --reference: one table of any number of files and runs. NAME=PATH names a system; of several with one
+    NAME the table has mean and deviation.
 
     Example: erfsfm-slam evaluate ours=results/latest "orb=orb_*.txt" --reference poses/09.txt
     """

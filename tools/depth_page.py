@@ -72,7 +72,7 @@ def run(
     estimate = None
     for way in options.refine:
         config = load_config(None, [*options.set, f"depth.refine={way}"])
-        pipeline = SlamPipeline(drive, predictor, config, noise=networks.noise)
+        pipeline = SlamPipeline(drive, predictor, config)
         estimate = estimate or pipeline.estimate()
         pipeline.fuse(estimate, partial(note, way))
 

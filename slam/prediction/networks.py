@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.inference import depth_at, limit_torch_threads
-from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
 from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
@@ -49,7 +47,6 @@ class NetworkPredictor:
         self._networks = networks
         self._intrinsics = intrinsics
         self._answers = answers
-        self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
         self._key = object()  # key of outputs cached in frames, which outlive the networks
         self.sources = networks.sources
 
@@ -62,8 +59,8 @@ class NetworkPredictor:
         height, width = frame.image.shape[:2]
         return depth_at(self._disparity(frame), height, width)
 
-    def snippet(self, frames: Sequence[Frame], with_residuals: bool = True) -> SnippetPoses:
-        """Poses of the sources of a snippet, and their residuals if wanted; the target is the middle frame."""
+    def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
+        """Poses of the sources of a snippet; the target is the middle frame."""
 
         def compute() -> Answer:
             return (self._networks.poses([self._prepared(frame) for frame in frames]),)
@@ -71,17 +68,7 @@ class NetworkPredictor:
         (T_source_target,) = self._answers("poses", frames, compute)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
-        residuals = None
-        if with_residuals:
-            residuals = self._residuals(frames, self._disparity(frames[middle]), T_source_target)
-        return SnippetPoses(frames[middle].index, sources, T_source_target, residuals)
-
-    def _residuals(
-        self, frames: Sequence[Frame], disparity: NDArray[np.float32], T_source_target: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Photometric residual ``(N,)`` of each source, over the difference of the images."""
-        thumbnails = [frame.derived("thumbnail", partial(thumbnail, frame.grey)) for frame in frames]
-        return self._residual.ratios(thumbnails, disparity, T_source_target)
+        return SnippetPoses(frames[middle].index, sources, T_source_target)
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:
         def compute() -> Answer:

@@ -89,31 +89,38 @@ def calibrate_network(
         depth_unit: ``(N,)``, the unit wanted per unit of learned depth at each frame.
     """
     pairs = [p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR and steps.keys() >= _between(p)]
-    frames = np.array([p.to_index - p.from_index for p in pairs], dtype=np.float64)
-    length, T_network = _lengths([p.T_from_to for p in pairs]), [_chained(steps, p) for p in pairs]
-    ratio = length / np.maximum(_lengths(T_network), 1e-12)
-    moves = length > _SHORTEST_PAIR * np.median(length / frames) * frames if pairs else np.zeros(0, dtype=bool)
-    if moves.sum() < LEAST_PAIRS:
-        return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), 0)
-    first = np.array([p.from_index for p in pairs])[moves]
-    unit = np.exp(_nearest_median(first, np.log(ratio[moves]), len(depth_unit)))
-    reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])[moves]
-    T_scaled = np.array(T_network)[moves]
-    T_scaled[:, :3, 3] *= unit[first, None]
-    error = tangent(invert(T_scaled) @ np.array([p.T_from_to for p in pairs])[moves]) / reach
+    if len(pairs) < LEAST_PAIRS:
+        return _by_depth(depth_unit)
+    first, last = np.array([p.ends for p in pairs]).T
+    T_network = np.array([reduce(np.matmul, (steps[k] for k in range(*p.ends))) for p in pairs])
+    T_geometric = np.array([p.T_from_to for p in pairs])
+    t_network, t_geometric = T_network[:, :3, 3], T_geometric[:, :3, 3]
+    length, frames = np.linalg.norm(t_geometric, axis=1), last - first
+    # along the measured motion, where the network's noise has no bias, as it has in the length
+    ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
+    used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
+    if used.sum() < LEAST_PAIRS:
+        return _by_depth(depth_unit)
+    unit = 1.0 / _nearest_median(first[used], ratio[used], len(depth_unit))
+    t_network *= unit[first, None]
+    reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
+    error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
     # the unit follows image geometry, and so shares its errors
-    shared = np.array([p.sigmas for p in pairs])[moves] / reach
-    noise = [_nearest_median(first, values, len(unit)) for values in (MAD_TO_SIGMA * np.abs(error), shared)]
-    return NetworkCalibration(unit, np.maximum(np.hypot(*noise), _LEAST_SIGMAS), len(first))
+    shared = np.array([p.sigmas for p in pairs])[used] / reach[used]
+    own, of_geometry = (_nearest_median(first[used], values, len(unit)) for values in (error, shared))
+    sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
+    return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
 
 
 def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibration) -> list[RelativePose]:
     """A factor for every step ``T_k_next`` of the network, in the unit of the calibration."""
+    if not steps:
+        return []
     scaled = calibration.scaled(dict(sorted(steps.items())))
-    lengths = _lengths(list(scaled.values()))
+    lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
     # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
     usual = running_median(lengths, _NEAREST_PAIRS + 1)
-    reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths) if steps else 0.0).clip(1e-9)
+    reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
     factors = []
     for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
         sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)
@@ -146,12 +153,8 @@ def _between(pose: RelativePose) -> set[int]:
     return set(range(pose.from_index, pose.to_index))
 
 
-def _chained(steps: Mapping[int, FloatArray], pose: RelativePose) -> FloatArray:
-    return np.asarray(reduce(np.matmul, (steps[k] for k in range(*pose.ends))))
-
-
-def _lengths(T_a_b: Sequence[FloatArray]) -> FloatArray:
-    return np.asarray(np.linalg.norm(np.array(T_a_b).reshape(-1, 4, 4)[:, :3, 3], axis=1))
+def _by_depth(depth_unit: FloatArray) -> NetworkCalibration:
+    return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), 0)
 
 
 def _nearest_median(frames: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:

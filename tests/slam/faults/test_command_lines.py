@@ -86,7 +86,6 @@ VERBS = (
     Verb("erfsfm", "convert", ("in/text.txt", "--output", "out")),
     Verb("erfsfm", "evaluate depth", ("--dataset", "in/root", "--weights", WEIGHTS)),
     Verb("erfsfm", "evaluate pose", ("--dataset", "in/root", "--sequence", "sim", "--weights", WEIGHTS)),
-    Verb("erfsfm", "calibrate-noise", ("--dataset", "in/root", "--weights", WEIGHTS)),
     Verb("erfsfm", "networks", (), quick=False),
     Verb("erfsfm", "receptive-field", ("--network", "posenet", "--output", "out.png"), quick=False),
     Verb("erfsfm", "train", ("--config", "tiny", "--dataset", "in/root", "--set", "training.steps=1"), quick=False),

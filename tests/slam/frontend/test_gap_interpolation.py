@@ -12,8 +12,8 @@ import pytest
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps, network_steps
-from slam.frontend.network_factors import chain_raw
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps
+from slam.frontend.network_factors import chain_raw, network_steps
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
 from slam.runtime.errors import SlamError
@@ -71,6 +71,20 @@ def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]) -> None:
     linked = {f.from_index for f in found.gap_steps}
     linked |= {step for s in found.trusted for step in range(min(s.sources), max(s.sources))}
     assert linked == set(range(COUNT - 1))
+
+
+def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth() -> None:
+    """The network's lengths are three quarters of those by learned depth."""
+    short = steady()
+    short[:, :3, 3] *= 0.75
+    steps = [measured(steady(), k, k + 1) for k in (*range(14), *range(26, COUNT - 1))]
+    unusable = set(range(17, 23))
+    found = interpolate_gaps(
+        collected(snippets_of(short, unusable), steps, unusable=dict.fromkeys(unusable, "black")), 4
+    )
+    for factor in found.gap_steps:
+        np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
+    np.testing.assert_allclose(chain_raw(found.snippets, COUNT), short, atol=1e-9)
 
 
 def test_the_motion_changes_evenly_from_before_to_after() -> None:

@@ -279,9 +279,9 @@ class Failing(OraclePredictor):
         self._fail("depth", frame.index)
         return super().depth(frame)
 
-    def snippet(self, frames: list[Frame], with_residuals: bool = True) -> SnippetPoses:
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
         self._fail("snippet", frames[-1].index)
-        return super().snippet(frames, with_residuals)
+        return super().snippet(frames)
 
     def _fail(self, question: str, index: int) -> None:
         if (question, index) == self._fails:

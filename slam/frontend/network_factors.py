@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slam.frames import RelativePose, SnippetPoses
 from slam.geometry.robust import MAD_TO_SIGMA, running_median
-from slam.geometry.se3 import FloatArray, chain, invert, tangent
+from slam.geometry.se3 import FloatArray, chain, invert, rigid, tangent
 from slam.runtime.errors import SlamError
 
 NETWORK_SOURCE = "network"
@@ -65,14 +65,13 @@ class NetworkCalibration:
 
 
 def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
-    """``T_k_next`` by k, unscaled: of each snippet's target to its next source, and of steps that no target begins."""
-    steps: dict[int, FloatArray] = {}
+    """``T_k_next`` by k, unscaled: the mean of the snippets that see both frames."""
+    seen: dict[int, list[FloatArray]] = {}
     for snippet in snippets:
-        T_target = snippet.T_target_camera
-        for k in range(min(snippet.sources), max(snippet.sources)):
-            if k == snippet.target or k not in steps:
-                steps[k] = invert(T_target[k]) @ T_target[k + 1]
-    return steps
+        for k, T_k_next in _steps(snippet).items():
+            seen.setdefault(k, []).append(T_k_next)
+    means = rigid(np.array([np.mean(each, axis=0) for each in seen.values()]).reshape(-1, 4, 4))
+    return dict(sorted(zip(seen, means, strict=True), key=lambda step: step[0]))
 
 
 def calibrate_network(
@@ -116,7 +115,7 @@ def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibra
     """A factor for every step ``T_k_next`` of the network, in the unit of the calibration."""
     if not steps:
         return []
-    scaled = calibration.scaled(dict(sorted(steps.items())))
+    scaled = calibration.scaled(steps)
     lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
     # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
     usual = running_median(lengths, _NEAREST_PAIRS + 1)
@@ -145,8 +144,15 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
         SlamError: if the sequence is shorter than a snippet or the snippets do not cover it.
     """
     _check_cover(snippets, count)
-    steps = network_steps(snippets)
+    steps: dict[int, FloatArray] = {}
+    for snippet in snippets:
+        steps |= {k: T for k, T in _steps(snippet).items() if k == snippet.target or k not in steps}
     return chain(np.array([steps[k] for k in range(count - 1)]))
+
+
+def _steps(snippet: SnippetPoses) -> dict[int, FloatArray]:
+    T_target = snippet.T_target_camera
+    return {k: invert(T_target[k]) @ T_target[k + 1] for k in range(min(snippet.sources), max(snippet.sources))}
 
 
 def _between(pose: RelativePose) -> set[int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps
-from slam.frontend.network_factors import chain_raw, network_steps
+from slam.frontend.network_factors import chain_raw
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
 from slam.runtime.errors import SlamError
@@ -161,13 +160,3 @@ def test_without_any_snippet_there_is_one_error() -> None:
     reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
     with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"):
         interpolate_gaps(collected([], unusable=reasons), 4)
-
-
-def test_steps_are_the_direct_poses_of_the_target() -> None:
-    first, second = snippet(steady(), 2), snippet(steady(), 3)
-    bent = second.T_source_target.copy()
-    bent[2, 0, 3] += 0.1  # source 4, the next of target 3
-    steps = network_steps([first, replace(second, T_source_target=bent)])
-    assert sorted(steps) == [0, 1, 2, 3, 4]
-    np.testing.assert_allclose(steps[2], STEP, atol=1e-12)
-    np.testing.assert_allclose(steps[3], invert(bent[2]), atol=1e-12)

@@ -61,6 +61,20 @@ def test_chain_uses_target_to_next_and_nothing_else():
     np.testing.assert_allclose(se3.invert(chained[10]) @ chained[9], last.T_source_target[2], atol=1e-9)
 
 
+def test_a_step_that_several_snippets_see_is_their_mean():
+    T, rng = drive(200), np.random.default_rng(3)
+    snippets = snippets_of(T)
+    for snippet in snippets:
+        snippet.T_source_target[:, :3, 3] += 0.1 * rng.normal(size=(4, 3))
+    raw, steps, true = chain_raw(snippets, 200), network_steps(snippets), se3.invert(T[:-1]) @ T[1:]
+    assert list(steps) == list(range(199))
+    single, mean = (
+        np.square(found[:, :3, 3] - true[:, :3, 3]).mean()
+        for found in (se3.invert(raw[:-1]) @ raw[1:], np.array(list(steps.values())))
+    )
+    assert mean < 0.6 * single
+
+
 def test_sequences_that_snippets_do_not_cover_are_refused():
     snippets = snippets_of(drive(12))
     with pytest.raises(SlamError, match="4 frames is shorter than one snippet"):

@@ -14,7 +14,7 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.cli_evaluate import evaluate_app
-from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights, print_rows
+from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights
 from erfsfm.cli_train import train, train_fusion
 from erfsfm.common import command_line
 
@@ -232,35 +232,6 @@ def export(
         return
     for file in files:
         typer.echo(f"{file.kind}: {file.preset} in {file.path}; differs from PyTorch by {file.difference:.1e}")
-
-
-@app.command("calibrate-noise")
-def calibrate_noise(
-    dataset: Annotated[list[Path], typer.Option(help="a KITTI odometry root with poses, real or simulated; repeat")],
-    weights: Weights = "default",
-    sequence: Annotated[list[str] | None, typer.Option(help="only these sequences; repeat")] = None,
-    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="also measure on frames seen in training")] = False,
-    device: Device = "auto",
-    seed: UnusedSeed = 0,
-    as_json: Json = False,
-) -> None:
-    """Measure the pose network's noise on held-out recordings; writes noise.yaml beside the weights, for SLAM.
-
-    Prints the coverage of each recording by the noise measured on the others; with one alone there is none.
-
-    Example: erfsfm calibrate-noise --weights sim --dataset worlds/600 --dataset KITTI
-    """
-    from erfsfm.evaluation.noise_fit import calibrate
-    from erfsfm.inference import DepthPosePredictor
-    from erfsfm.model_record import find_weights
-    from erfsfm.pose_noise import NOISE_FILE, write_pose_noise
-
-    folder = find_weights(weights)
-    predictor = DepthPosePredictor.from_weights(weights, device)
-    noise, rows = calibrate(predictor, dataset, sequence or (), allow_leak, predictor.pose_sha256)
-    write_pose_noise(folder, noise)
-    print_rows(rows, as_json)
-    typer.echo(f"noise in {folder / NOISE_FILE}", err=True)
 
 
 def main() -> None:

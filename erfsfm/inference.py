@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from collections.abc import Callable, Sequence
 from ctypes.util import find_library
@@ -24,16 +23,13 @@ from erfsfm.common.readers.images import read_image as read_image  # images are 
 from erfsfm.common.readers.images import resize_image
 from erfsfm.common.readers.pinhole import MOST_PIXELS
 from erfsfm.common.threads import usable_cores
-from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record, weights_sha256
+from erfsfm.model_record import ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.model_record import record_of_whole_weights as record_of_whole_weights
 from erfsfm.networks.onnx_graph import OnnxGraph
-from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
     from erfsfm.checkpoint import Model
-
-logger = logging.getLogger(__name__)
 
 F = TypeVar("F", np.float32, np.float64)
 Array = NDArray[np.float32]
@@ -105,15 +101,8 @@ def _graphs(folder: Path, sha256: str) -> _Networks:
 
 
 class DepthPosePredictor:
-    """Depth of single images and poses of snippets, in one unknown scale.
+    """Depth of single images and poses of snippets, each in an unknown scale."""
 
-    ``noise`` is the noise model of the poses if it was measured with these weights, else None; ``noise_sha256`` is that
-    of its file.
-    """
-
-    noise: PoseNoise | None = None
-    noise_sha256: str = ""
-    pose_sha256: str = ""
     origin: str = "these weights"
 
     def __init__(self, record: ModelRecord, networks: _Networks, device: Device, sha256: str = "") -> None:
@@ -149,7 +138,7 @@ class DepthPosePredictor:
                 first call, in some two seconds, and kept on disk; from then on PyTorch is not imported.
 
         Raises:
-            CheckpointError: missing or damaged weights, or a damaged noise.yaml beside them.
+            CheckpointError: missing or damaged weights.
             ConfigError: a device that is not there.
         """
         folder, chosen = find_weights(name_or_dir), choose_device(device)
@@ -161,15 +150,6 @@ class DepthPosePredictor:
 
             predictor = cls.of(load_model(folder), chosen, sha256)
         predictor.origin = str(folder)
-        predictor.pose_sha256 = file_sha256(folder / FILES[1])
-        noise = read_pose_noise(folder)
-        if noise is not None and noise.pose_sha256 != predictor.pose_sha256:
-            logger.warning(
-                "%s was measured with other weights and is not used: run erfsfm calibrate-noise again",
-                folder / NOISE_FILE,
-            )
-        elif noise is not None:
-            predictor.noise, predictor.noise_sha256 = noise, file_sha256(folder / NOISE_FILE)
         return predictor
 
     def leaks(self, names: Sequence[str]) -> list[str]:

@@ -71,7 +71,7 @@ class Intrinsics(Pinhole):
 class Frame:
     """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds.
 
-    Values that depend on the image alone (grey levels, thumbnails, the networks' input) are computed once and kept.
+    Values that depend on the image alone (grey levels, the networks' input) are computed once and kept.
     """
 
     index: int
@@ -128,14 +128,12 @@ class SnippetPoses:
     """Output of the pose network for one snippet.
 
     ``T_source_target`` ``(N, 4, 4)``: target camera to source camera, unscaled, row k for
-    ``sources[k]`` in time order; ``target`` is the middle frame. ``residuals`` ``(N,)`` are the photometric
-    residuals over the images' differences, None where not computed.
+    ``sources[k]`` in time order; ``target`` is the middle frame.
     """
 
     target: int
     sources: tuple[int, ...]
     T_source_target: FloatArray
-    residuals: FloatArray | None = None
 
     @property
     def T_target_camera(self) -> dict[int, FloatArray]:
@@ -145,18 +143,15 @@ class SnippetPoses:
 
 
 class Predictor(Protocol):
-    """Depth and snippet poses in one common, unknown scale: networks, depth from elsewhere, or an oracle."""
+    """Depth and snippet poses, each in an unknown scale: networks, depth from elsewhere, or an oracle."""
 
     sources: int
 
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` of a frame, at the image's size: positive and finite, or NaN where unknown."""
 
-    def snippet(self, frames: list[Frame], with_residuals: bool = True) -> SnippetPoses:
-        """Poses of the sources of a snippet whose target is the middle frame.
-
-        Residuals need the target's depth, which costs as much as the poses where nothing else asks for it.
-        """
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
+        """Poses of the sources of a snippet whose target is the middle frame."""
 
     def executor(self) -> Executor:
         """A new executor of one thread for this predictor, with its number of cores; the user shuts it down."""

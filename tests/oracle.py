@@ -77,7 +77,7 @@ class OraclePredictor:
             depth = depth * np.exp(self._noise.depth_relative_sigma * smooth)
         return np.asarray(depth, dtype=np.float32)
 
-    def snippet(self, frames: list[Frame], with_residuals: bool = True) -> SnippetPoses:
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
         """True relative poses in the unscaled unit of the target, each with its own error."""
         if len(frames) != self.sources + 1:
             raise SlamError(f"a snippet has {self.sources + 1} frames; got {len(frames)}")

@@ -54,7 +54,6 @@ INTERFACE = {
     "slam.sequences.loader": ("Loader",),
     "slam.prediction.depth_source": ("DepthSource",),
     "erfsfm.inference": ("DepthPosePredictor",),
-    "erfsfm.pose_noise": ("PoseNoise",),
 }
 # of names that have other members for the program itself
 MEMBERS = {"RunFolder": ["open", "metrics", "trajectory", "mesh", "cloud", "keyframes"], "RunRequest": []}

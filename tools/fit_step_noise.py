@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from shared.command import one_line_errors, parser_of
 
 from erfsfm.inference import DepthPosePredictor
-from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig, load_config
+from slam.config.sections import VisualOdometryConfig, load_config
 from slam.evaluation.coverage import LEVELS, squared_bound
 from slam.frames import RelativePose
 from slam.frontend.drive import Drive
@@ -119,7 +119,7 @@ def measure(name: str, networks: DepthPosePredictor) -> DriveSteps:
         raise SlamError(f"{name} has no true poses: give a recording with poses")
     predictor = NetworkPredictor(networks, recording.intrinsics)
     config = load_config(None, QUIET)
-    found = SlamPipeline(recording, predictor, config, noise=networks.noise).estimate()
+    found = SlamPipeline(recording, predictor, config).estimate()
     T_true = np.array(recording.reference)
     T_true[:, :3, 3] *= umeyama(found.optimised.positions, T_true[:, :3, 3], with_scale=True).scale
     return DriveSteps.of(Path(root).name + (sequence and f" {sequence}"), found.drive.steps, found.scale, T_true)
@@ -129,7 +129,7 @@ def _factors(steps: StepTable, scale: Scale, ratios: FloatArray) -> list[Relativ
     """The triangulated steps with a length, as they enter the graph."""
     known = Drive(motions=[motion for ends, motion in steps.triangulated.items() if ends in scale.lengths])
     visual_odometry = VisualOdometryConfig(**dict(zip(RATIOS, ratios.tolist(), strict=True)))
-    return make_factors(known, scale, None, PoseNetworkConfig(use="gaps"), visual_odometry)
+    return make_factors(known, scale, visual_odometry)
 
 
 @one_line_errors()

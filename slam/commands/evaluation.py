@@ -116,8 +116,8 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
         print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
         kind = "tum" if all(each.timed for each in whole) else "kitti"
         names = (estimate, "trajectory_optimised"), (reference, REFERENCE)
-        files = (path / f"{name}.{kind}.txt" if path.is_dir() else path for path, name in names)
-        for line in evo_commands(*files, format):
+        ours, theirs = (path / f"{name}.{kind}.txt" if path.is_dir() else path for path, name in names)
+        for line in evo_commands(ours, theirs, format):
             typer.echo(line)
     broken = exceeded(metrics, limits)
     if broken:

@@ -1,4 +1,4 @@
-"""Settings of the front end: pose network, visual odometry, keyframes, gaps, step lengths, LiDAR, GPS and scale."""
+"""Settings of the front end: visual odometry, keyframes, gaps, step lengths, LiDAR, GPS and scale."""
 
 from __future__ import annotations
 
@@ -10,15 +10,6 @@ from pydantic import Field, field_validator, model_validator
 from erfsfm.common.config_tree import Section
 
 ScaleMode = Literal["none", "camera-height", "lidar", "reference", "known", "gps"]
-
-
-class PoseNetworkConfig(Section):
-    """Factors of the pose network, see ``frontend/network_factors.py``."""
-
-    use: Literal["calibrated", "gaps", "always"] = Field(
-        default="calibrated",
-        description="gaps: only where image geometry fails; calibrated: always if there is a noise.yaml, else gaps",
-    )
 
 
 class VisualOdometryConfig(Section):

@@ -20,7 +20,6 @@ from slam.config.frontend import (
     KeyframesConfig,
     LengthConfig,
     LidarConfig,
-    PoseNetworkConfig,
     RoadConfig,
     ScaleConfig,
     ScaleMode,
@@ -39,7 +38,6 @@ __all__ = [
     "MappingConfig",
     "OutputConfig",
     "PoseGraphConfig",
-    "PoseNetworkConfig",
     "RoadConfig",
     "ScaleConfig",
     "ScaleMode",
@@ -244,7 +242,6 @@ class SlamConfig(Section):
     """All settings of a run."""
 
     depth: DepthConfig = DepthConfig()
-    pose_network: PoseNetworkConfig = PoseNetworkConfig()
     visual_odometry: VisualOdometryConfig = VisualOdometryConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     gaps: GapsConfig = GapsConfig()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from erfsfm.pose_noise import PoseNoise
-from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
@@ -17,62 +17,51 @@ from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
     STUDENT_T_DOF,
-    calibrated_factors,
-    measured_noise,
+    calibrate_network,
     network_factors,
-    without_measured,
+    network_steps,
 )
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.geometry.se3 import FloatArray, invert, rigid
+from slam.geometry.se3 import FloatArray, rigid
+
+logger = logging.getLogger(__name__)
 
 
-def make_factors(
-    drive: Drive,
-    scale: Scale,
-    noise: PoseNoise | None,
-    pose_network: PoseNetworkConfig,
-    visual_odometry: VisualOdometryConfig,
-) -> list[RelativePose]:
+def make_factors(drive: Drive, scale: Scale, visual_odometry: VisualOdometryConfig) -> list[RelativePose]:
     """All relative poses with their noise, in the unit of the scale.
 
     Args:
         drive: completed.
         scale: of each frame, and the lengths of steps.
-        noise: of the pose network; None measures it against image geometry on this drive.
-        pose_network: which of its factors are used.
         visual_odometry: noise of image geometry.
     """
-    geometric = _geometric(drive.steps, scale, visual_odometry)
-    # the noise of the networks is that of their own unit
-    unscaled = [pose.scaled(1.0 / scale.unit_at(pose)) for pose in geometric]
-    if noise is None:
-        networks = network_factors(drive.trusted, measured_noise(drive.trusted, unscaled))
-    else:
-        networks = calibrated_factors(drive.trusted, unscaled, noise)
-    if pose_network.use == "gaps" or (pose_network.use == "calibrated" and noise is None):
-        networks = without_measured(networks, geometric)
     maps = drive.map_poses
-
-    def outside(poses: Sequence[RelativePose]) -> list[RelativePose]:
-        return [pose for pose in poses if not maps.is_inside(pose)]
-
-    by_network, interpolated = (
-        [scale.scaled(pose) for pose in outside(poses)] for poses in (networks, drive.gap_steps)
+    geometric = _geometric(drive.steps, scale, visual_odometry)
+    by_keyframes = scaled_poses(maps.poses, maps, scale)
+    steps = network_steps(drive.trusted)
+    calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
+    logger.info("pose network: %s", calibration.over(scale.per_frame))
+    networks = network_factors(steps, calibration)
+    interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
+    by_network, interpolated, by_image = (
+        [pose for pose in poses if not maps.is_inside(pose)] for poses in (networks, interpolated, geometric)
     )
-    by_image, by_keyframes = outside(geometric), scaled_poses(maps.poses, maps, scale)
     interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
     return [*by_network, *interpolated, *by_image, *by_keyframes]
 
 
 def scaled_steps(drive: Drive, scale: Scale) -> list[RelativePose]:
-    """Interpolated steps and those of image geometry in the unit of the scale, without the noise of a graph."""
-    steps = [scale.scaled(pose) for pose in drive.gap_steps]
+    """Steps of the network, interpolated and of image geometry in the unit of the scale, the last without noise."""
+    interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
+    by_image = []
     for ends, motion in drive.steps.motions.items():
         length, pose = scale.lengths.get(ends) if motion.is_triangulated else None, motion.relative_pose
-        steps.append(scale.scaled(pose) if length is None else pose.scaled(length.value / motion.length_unscaled))
-    return steps
+        by_image.append(scale.scaled(pose) if length is None else pose.scaled(length.value / motion.length_unscaled))
+    steps = network_steps(drive.trusted)
+    by_network = network_factors(steps, calibrate_network(steps, by_image, scale.per_frame))
+    return [*by_network, *interpolated, *by_image]
 
 
 def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
@@ -97,35 +86,29 @@ def depth_units(maps: KeyframePoses, scale: Scale) -> dict[int, float]:
     return {number: float(np.median(scale.per_frame[maps.frames_of(number)])) for number in numbers}
 
 
-def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
-    """Odometry without a graph ``(N, 4, 4)``: each frame by the geometric step that ends there, else the network.
+def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
+    """Odometry without a graph ``(count, 4, 4)``: each frame by the best factor that ends there.
 
     Args:
-        factors: in the unit of the scale; of several of equal length that end at a frame, the last one is taken.
-        T_network: the raw network trajectory, unscaled.
-        scale: of the network's steps.
+        factors: in one unit, from earlier to later frames; one at least ends at every frame but the first. Of several
+            that are equally good and long, the last one is taken.
+        count: frames.
     """
     arriving: dict[int, RelativePose] = {}
     for factor in factors:
         first, last = factor.ends
-        if factor.source == NETWORK_SOURCE or first >= last:
-            continue
-        # after a gap, a place in the map is known better than any motion over the gap
-        if last not in arriving or _precedence(factor) >= _precedence(arriving[last]):
+        if first < last and (last not in arriving or _precedence(factor) >= _precedence(arriving[last])):
             arriving[last] = factor
-    increments = invert(T_network[:-1]) @ T_network[1:]
-    increments[:, :3, 3] *= scale.per_frame[:-1, None]
-    before = np.arange(len(increments))
-    for k, step in arriving.items():
-        before[k - 1], increments[k - 1] = step.from_index, step.T_from_to
-    T_world_camera = np.tile(np.eye(4), (len(T_network), 1, 1))
-    for k, (first, T_first_camera) in enumerate(zip(before.tolist(), rigid(increments), strict=True), start=1):
-        np.matmul(T_world_camera[first], T_first_camera, out=T_world_camera[k])
+    T_world_camera = np.tile(np.eye(4), (count, 1, 1))
+    T_from_to = rigid(np.array([arriving[k].T_from_to for k in range(1, count)]).reshape(-1, 4, 4))
+    for k, T_first_camera in enumerate(T_from_to, start=1):
+        np.matmul(T_world_camera[arriving[k].from_index], T_first_camera, out=T_world_camera[k])
     return T_world_camera
 
 
-def _precedence(factor: RelativePose) -> tuple[bool, int]:
-    return factor.source == KEYFRAME_SOURCE, factor.from_index
+def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
+    """After a gap, a place in the map is known better than any motion over the gap; the network is known least."""
+    return factor.source == KEYFRAME_SOURCE, factor.source != NETWORK_SOURCE, factor.from_index
 
 
 def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> list[RelativePose]:

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from erfsfm.pose_noise import tangent
 from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
+from slam.frontend.network_factors import calibrate_network, network_steps
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.segments import find_cuts, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
-from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError
 
 INTERPOLATED_SOURCE = "interpolated"
@@ -83,15 +83,17 @@ def interpolate_gaps(
         why = next(iter(unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(unusable, repeated)
-    by_network = network_steps(snippets)
+    raw = network_steps(snippets)
+    calibration = calibrate_network(raw, drive.steps.relative_poses, np.ones(count))
+    by_network = calibration.scaled(raw)
     frozen, steps = _without_frozen(by_network, drive.steps, map_poses, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     spans = ((s, {s.target, *s.sources}) for s in snippets)
     trusted = [s for s, span in spans if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)]
-    filled = _filled(snippets, _completed(by_network, range(count - 1)), count, sources)
+    filled = _filled(snippets, _completed(raw, range(count - 1)), count, sources)
     by_image = {m.ends[0]: m.relative_pose.T_from_to for m in steps if m.ends == (m.ends[0], m.ends[0] + 1)}
     # snippets of frozen images alone are still the best estimate available
-    known = network_steps(trusted) | by_image or by_network
+    known = calibration.scaled(network_steps(trusted)) | by_image or by_network
     covered = {step for s in trusted for step in range(min(s.sources), max(s.sources))} | by_image.keys()
     loose = [step for step in range(count - 1) if step not in covered]
     motion = _completed(known, loose)
@@ -107,17 +109,6 @@ def interpolate_gaps(
         views=[view for view in drive.views if view.index not in frames],
         keyframes=[keyframe for keyframe in drive.keyframes if keyframe.index not in frames],
     )
-
-
-def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
-    """``T_k_next`` by k of each snippet's target to its next source, and of the steps before the first target."""
-    steps: dict[int, FloatArray] = {}
-    for snippet in snippets:
-        T_target = snippet.T_target_camera
-        for k in range(min(snippet.sources), max(snippet.sources)):
-            if k == snippet.target or k not in steps:
-                steps[k] = invert(T_target[k]) @ T_target[k + 1]
-    return steps
 
 
 def _without_frozen(

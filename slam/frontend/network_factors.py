@@ -1,223 +1,131 @@
-"""The pose network's snippets as relative-pose factors, and as the raw trajectory chained from them.
+"""The pose network's steps as factors, in a unit and with a noise measured on the drive, and its raw trajectory.
 
-With calibrated noise (`erfsfm.pose_noise`) each pair of frames gets one factor: the mean of its measurements by
-overlapping snippets, with the correlation of their errors. On the drive this noise is scaled to the
-disagreement with image geometry, separately by turn rate, and the noise of image geometry is added. Errors have
-heavier tails than normal ones and are correlated from snippet to snippet: the graph takes inflated sigmas for that
-(``docs/design/noise-and-the-pose-graph.md``).
-
-Without calibrated noise, sigmas are proportional to the motion. For a pair n frames apart the rotation sigma is
-``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` times the length plus a
-floor (a ratio of the median one-frame step). Overlapping snippets measure a pair again from nearly the same images, so
-their errors are taken as fully correlated: m measurements of one pair get their sigmas times sqrt(m) and count as one.
+The network's lengths have a unit of their own, which is not that of learned depth and changes with the street. Both it
+and the network's noise are measured against the steps of image geometry (``docs/design/learned-priors.md``).
 """
 
 from __future__ import annotations
 
-import logging
-import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
 
-from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
-from slam.frames import Ends, RelativePose, SnippetPoses
-from slam.frontend.step_table import path_between, shortest_by_start
-from slam.geometry.robust import mad_sigma, mad_sigmas
-from slam.geometry.se3 import FloatArray, chain, invert, nearest_rotation
+from slam.frames import RelativePose, SnippetPoses
+from slam.geometry.robust import MAD_TO_SIGMA, running_median
+from slam.geometry.se3 import FloatArray, chain, invert, rigid, tangent
 from slam.runtime.errors import SlamError
 
 NETWORK_SOURCE = "network"
-STUDENT_T_DOF = 12.0  # of the errors of measured steps and pairs: degrees of freedom of Student's t
-# image geometry has errors too: sigmas are not scaled below this factor
-_LEAST_SCALING = 0.3
-_STRETCHES = 4
-
-logger = logging.getLogger(__name__)
-_NOISE_STEPS = 20  # steps also measured by image geometry, from which on the noise is estimated on this sequence
-_TRANSLATION_FLOOR_RATIO = 0.05  # least translation sigma over the median one-frame step, without noise.yaml
+STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
+LEAST_PAIRS = 20  # steps that image geometry measured too, from which on unit and noise are measured
+_NEAREST_PAIRS = 40  # in time, by which they are measured
+_LONGEST_PAIR = 4  # frames: as far as a snippet reaches
+_SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
+_CORRELATED_STEPS = 50  # over which errors are taken as equal
+# of a step whose noise is not measured: radians, and over its length in the unit of learned depth, from which that of
+# the network differs by so much from drive to drive
+_USUAL_SIGMAS = np.repeat([np.deg2rad(0.3), 0.3], 3)
+_LEAST_SIGMAS = np.repeat([np.deg2rad(0.03), 0.02], 3)
 
 
 @dataclass(frozen=True)
-class UncalibratedNoise:
-    """Noise of a pose network without ``noise.yaml``.
+class NetworkCalibration:
+    """Unit and noise of the pose network's steps from each of N frames, measured on the drive.
 
     Attributes:
-        rotation_sigma_deg: of a step between neighbouring frames, degrees.
-        translation_relative_sigma: over the length of the step.
+        unit: ``(N,)``, length per unscaled length of the step.
+        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length of a step.
+        pairs: steps by which they were measured; 0 where these were too few.
     """
 
-    rotation_sigma_deg: float = 0.3
-    translation_relative_sigma: float = 0.1
+    unit: FloatArray
+    sigmas: FloatArray
+    pairs: int
+
+    def over(self, depth_unit: FloatArray) -> str:
+        """The unit over that of learned depth ``(N,)`` and the noise, for logs."""
+        if not self.pairs:
+            return f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
+        least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
+        rotation, translation = np.rad2deg(np.median(self.sigmas[:, :3])), np.median(self.sigmas[:, 5])
+        return (
+            f"by {self.pairs} steps its unit is {usual:.2f} ({least:.2f} to {most:.2f}) of that of learned depth, and "
+            f"its noise {rotation:.2f} degrees and {100 * translation:.0f} % of a step"
+        )
+
+    def scaled(self, steps: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """Steps ``T_k_next`` by k in the unit."""
+        scaled = {k: T_k_next.copy() for k, T_k_next in steps.items()}
+        for k, T_k_next in scaled.items():
+            T_k_next[:3, 3] *= self.unit[k]
+        return scaled
 
 
-def network_factors(snippets: Sequence[SnippetPoses], noise: UncalibratedNoise) -> list[RelativePose]:
-    """Every direct pose of every snippet as ``T_source_target``, unscaled, with its noise."""
-    multiplicity = Counter(_pair(source, s.target) for s in snippets for source in s.sources)
-    floor = max(_TRANSLATION_FLOOR_RATIO * _median_step(snippets), 1e-9)
-    factors = []
+def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
+    """``T_k_next`` by k, unscaled: the mean of the snippets that see both frames."""
+    seen: dict[int, list[FloatArray]] = {}
     for snippet in snippets:
-        for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True):
-            repeated = np.sqrt(multiplicity[_pair(source, snippet.target)])
-            rotation = np.deg2rad(noise.rotation_sigma_deg) * np.sqrt(abs(snippet.target - source))
-            length = float(np.linalg.norm(T_source_target[:3, 3]))
-            translation = noise.translation_relative_sigma * length + floor
-            sigmas = repeated * np.repeat([rotation, translation], 3)
-            factors.append(RelativePose(source, snippet.target, T_source_target, sigmas, NETWORK_SOURCE))
-    return factors
+        for k, T_k_next in _steps(snippet).items():
+            seen.setdefault(k, []).append(T_k_next)
+    means = rigid(np.array([np.mean(each, axis=0) for each in seen.values()]).reshape(-1, 4, 4))
+    return dict(sorted(zip(seen, means, strict=True), key=lambda step: step[0]))
 
 
-def calibrated_factors(
-    snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], noise: PoseNoise
-) -> list[RelativePose]:
-    """One factor for every pair of frames that snippets measured, ``T_first_last``, unscaled, with calibrated noise.
+def calibrate_network(
+    steps: Mapping[int, FloatArray], geometric: Sequence[RelativePose], depth_unit: FloatArray
+) -> NetworkCalibration:
+    """The unit and the noise of the network's steps, by the poses that image geometry measured too.
+
+    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths are in the unit of
+    learned depth, and accordingly uncertain.
 
     Args:
-        snippets: measured by the network.
-        geometric: measured by image geometry, unscaled, with its full noise.
-        noise: of this network, scaled by at least 20 common measurements. With fewer it says too little of this drive:
-            only pairs that image geometry did not measure have factors.
+        steps: ``T_k_next`` of the network, unscaled.
+        geometric: relative poses in the unit wanted.
+        depth_unit: ``(N,)``, the unit wanted per unit of learned depth at each frame.
     """
-    pairs = pair_poses([(s.target, s.sources, s.T_source_target, s.residuals) for s in snippets])
-    if not pairs:
-        return []
-    law = np.stack([noise.sigmas(pair) for pair in pairs])
-    steps = {pose.ends: pose for pose in geometric}
-    student_t_dof = STUDENT_T_DOF if len(steps) >= _NOISE_STEPS else math.inf
-    from_geometry = _from_geometry(pairs, steps)
-    scaling = _scaling(pairs, from_geometry / law, _NOISE_STEPS)
-    redundant = np.isfinite(from_geometry).all(axis=1)
-    usable = np.logical_or(np.isfinite(scaling).all(axis=1), ~redundant)
-    sigmas = np.hypot(np.nan_to_num(scaling, nan=1.0) * law, _noise_of_geometry(pairs, steps))
-    correlated_sigmas = _persistence(pairs, from_geometry / sigmas, _NOISE_STEPS) * sigmas
-    return [
-        RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE, chained, student_t_dof)
-        for pair, own, chained, use in zip(pairs, sigmas, correlated_sigmas, usable, strict=True)
-        if use
-    ]
+    pairs = [p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR and steps.keys() >= _between(p)]
+    if len(pairs) < LEAST_PAIRS:
+        return _by_depth(depth_unit)
+    first, last = np.array([p.ends for p in pairs]).T
+    T_network = np.array([reduce(np.matmul, (steps[k] for k in range(*p.ends))) for p in pairs])
+    T_geometric = np.array([p.T_from_to for p in pairs])
+    t_network, t_geometric = T_network[:, :3, 3], T_geometric[:, :3, 3]
+    length, frames = np.linalg.norm(t_geometric, axis=1), last - first
+    # along the measured motion, where the network's noise has no bias, as it has in the length
+    ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
+    used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
+    if used.sum() < LEAST_PAIRS:
+        return _by_depth(depth_unit)
+    unit = 1.0 / _nearest_median(first[used], ratio[used], len(depth_unit))
+    t_network *= unit[first, None]
+    reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
+    error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
+    # the unit follows image geometry, and so shares its errors
+    shared = np.array([p.sigmas for p in pairs])[used] / reach[used]
+    own, of_geometry = (_nearest_median(first[used], values, len(unit)) for values in (error, shared))
+    sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
+    return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
 
 
-def _from_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativePose]) -> FloatArray:
-    """Differences of pairs from chained steps of image geometry, ``(P, 6)``; NaN where a step was not measured."""
-    differences = np.full((len(pairs), 6), np.nan)
-    by_start = shortest_by_start(steps)
-    paths = [path_between(by_start, pair.first, pair.last) for pair in pairs]
-    rows = [k for k, path in enumerate(paths) if path is not None]
-    if rows:
-        T_geometric = np.stack([reduce(np.matmul, [steps[ends].T_from_to for ends in paths[k] or ()]) for k in rows])
-        differences[rows] = difference(np.stack([pairs[k].T_first_last for k in rows]), T_geometric)
-    return differences
-
-
-def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
-    """Factors ``(P, 6)`` on the sigmas of pairs, by ``whitened`` ``(P, 6)`` differences from image geometry.
-
-    One for each distance in frames and, with enough measurements, each tertile of the turn rate; NaN with few.
-    """
-    scaling = np.full_like(whitened, np.nan)
-    frames = np.array([pair.last - pair.first for pair in pairs])
-    turn_rates = np.array([pair.turn for pair in pairs]) / frames
-    measured = np.isfinite(whitened).all(axis=1)
-    for distance in np.unique(frames):
-        at_distance = frames == distance
-        seen = at_distance & measured
-        if seen.sum() < least:
-            continue
-        borders = np.quantile(turn_rates[seen], (1 / 3, 2 / 3)) if seen.sum() >= 3 * least else []
-        third = np.searchsorted(borders, turn_rates)
-        for which in np.unique(third[seen]):
-            factors = mad_sigmas(whitened[seen & (third == which)])
-            scaling[at_distance & (third == which)] = np.maximum(factors, _LEAST_SCALING)
-            logger.info(
-                "pose network's noise over %d frames, turn rate class %d of %d: times %s",
-                distance,
-                which + 1,
-                len(borders) + 1,
-                factors.round(2),
-            )
-    return scaling
-
-
-def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
-    """Factors ``(P, 6)`` on the sigmas of pairs for the correlation of their errors along the drive.
-
-    The network's errors on neighbouring snippets are correlated. Sums of whitened errors over a quarter of the drive
-    are compared with those of independent errors. With few measured pairs, errors are taken as constant over a
-    quarter of the drive. Pairs of different distances in frames are redundant: each distance counts as one part.
-    """
-    factors = np.ones_like(whitened)
-    frames = np.array([pair.last - pair.first for pair in pairs])
-    distances = np.unique(frames)
-    for distance in distances:
-        at_distance = frames == distance
-        errors = whitened[at_distance & np.isfinite(whitened).all(axis=1)]
-        stretch = len(errors) // _STRETCHES
-        if stretch < least:
-            factors[at_distance] = np.sqrt(max(at_distance.sum() // _STRETCHES, 1))
-            continue
-        added = np.cumsum(np.vstack([np.zeros(6), errors]), axis=0)
-        growth = mad_sigmas(added[stretch:] - added[:-stretch]) / np.sqrt(stretch)
-        factors[at_distance] = np.maximum(growth, 1.0)
-        logger.info("pose network's noise over %d frames, along the drive: times %s", distance, growth.round(2))
-    return np.asarray(factors * np.sqrt(len(distances)))
-
-
-def _noise_of_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativePose]) -> FloatArray:
-    """Sigmas ``(P, 6)`` of the chained geometric steps between the frames of pairs; median ones where not measured."""
+def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibration) -> list[RelativePose]:
+    """A factor for every step ``T_k_next`` of the network, in the unit of the calibration."""
     if not steps:
-        return np.zeros((len(pairs), 6))
-    by_start = shortest_by_start(steps)
-    usual = np.median([steps[ends].sigmas for ends in by_start.values()], axis=0)
-    sigmas = []
-    for pair in pairs:
-        between = []
-        frame = pair.first
-        while frame < pair.last:
-            ends = by_start.get(frame, (frame, frame + 1))
-            between.append(steps[ends].sigmas if ends in steps and ends[1] <= pair.last else usual)
-            frame = ends[1]
-        sigmas.append(np.linalg.norm(between, axis=0))
-    return np.stack(sigmas)
-
-
-def without_measured(factors: Sequence[RelativePose], geometric: Sequence[RelativePose]) -> list[RelativePose]:
-    """The factors between whose frames image geometry did not measure every step.
-
-    The network's errors on neighbouring snippets are correlated: beside a geometric factor of the same step, many of
-    its factors would count as many independent measurements, where they are one less accurate one.
-    """
-    by_start = shortest_by_start(pose.ends for pose in geometric)
-    return [factor for factor in factors if path_between(by_start, *sorted(factor.ends)) is None]
-
-
-def measured_noise(snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose]) -> UncalibratedNoise:
-    """The noise of this network on this drive, by comparison with image geometry.
-
-    Sigmas are 1.48 times the median absolute difference of one-frame steps, at least the usual ones;
-    with fewer than 20 common steps the usual ones are used.
-    """
-    by_pair = {(g.from_index, g.to_index): g.T_from_to for g in geometric}
-    rotations, shifts = [], []
-    for snippet in snippets:
-        for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True):
-            T_geometric = by_pair.get((source, snippet.target))
-            length = 0.0 if T_geometric is None else float(np.linalg.norm(T_geometric[:3, 3]))
-            if T_geometric is None or abs(snippet.target - source) != 1 or length == 0:
-                continue
-            error = invert(T_geometric) @ T_source_target
-            rotations.append(Rotation.from_matrix(nearest_rotation(error[:3, :3])).as_rotvec())
-            shifts.append((T_source_target[:3, 3] - T_geometric[:3, 3]) / length)
-    usual = UncalibratedNoise()
-    if len(rotations) < _NOISE_STEPS:
-        return usual
-    rotation, shift = (mad_sigma(np.concatenate(e)) for e in (rotations, shifts))
-    return UncalibratedNoise(
-        max(usual.rotation_sigma_deg, float(np.rad2deg(rotation))), max(usual.translation_relative_sigma, shift)
-    )
+        return []
+    scaled = calibration.scaled(steps)
+    lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
+    # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
+    usual = running_median(lengths, _NEAREST_PAIRS + 1)
+    reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
+    factors = []
+    for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
+        sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)
+        widened = np.sqrt(_CORRELATED_STEPS) * sigmas
+        factors.append(RelativePose(k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widened, STUDENT_T_DOF))
+    return factors
 
 
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
@@ -236,30 +144,31 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
         SlamError: if the sequence is shorter than a snippet or the snippets do not cover it.
     """
     _check_cover(snippets, count)
-    first, last = snippets[0], snippets[-1]
-    T_first_camera = np.tile(np.eye(4), (count, 1, 1))  # in the camera of the first target until the end
-    T_first_camera[: first.target] = [first.T_target_camera[k] for k in range(first.target)] or np.zeros((0, 4, 4))
-    increments = [snippet.T_target_camera[snippet.target + 1] for snippet in snippets[:-1]]
-    T_first_camera[first.target : last.target + 1] = chain(np.array(increments).reshape(-1, 4, 4))
-    for k in range(last.target + 1, count):
-        T_first_camera[k] = T_first_camera[last.target] @ last.T_target_camera[k]
-    T_world_camera: FloatArray = invert(T_first_camera[0]) @ T_first_camera
-    T_world_camera[0] = np.eye(4)
-    return T_world_camera
+    steps: dict[int, FloatArray] = {}
+    for snippet in snippets:
+        steps |= {k: T for k, T in _steps(snippet).items() if k == snippet.target or k not in steps}
+    return chain(np.array([steps[k] for k in range(count - 1)]))
 
 
-def _pair(a: int, b: int) -> tuple[int, int]:
-    return min(a, b), max(a, b)
+def _steps(snippet: SnippetPoses) -> dict[int, FloatArray]:
+    T_target = snippet.T_target_camera
+    return {k: invert(T_target[k]) @ T_target[k + 1] for k in range(min(snippet.sources), max(snippet.sources))}
 
 
-def _median_step(snippets: Sequence[SnippetPoses]) -> float:
-    steps = [
-        float(np.linalg.norm(T_source_target[:3, 3]))
-        for snippet in snippets
-        for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True)
-        if abs(source - snippet.target) == 1
-    ]
-    return float(np.median(steps)) if steps else 0.0
+def _between(pose: RelativePose) -> set[int]:
+    return set(range(pose.from_index, pose.to_index))
+
+
+def _by_depth(depth_unit: FloatArray) -> NetworkCalibration:
+    return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), 0)
+
+
+def _nearest_median(frames: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
+    """The median value ``(count, ...)`` of the pairs nearest to each frame, of pairs ``(P, ...)`` by first frames."""
+    order, width = np.argsort(frames, kind="stable"), min(_NEAREST_PAIRS, len(frames))
+    windows = np.lib.stride_tricks.sliding_window_view(values[order], width, axis=0)
+    place = np.searchsorted(frames[order], np.arange(count)) - width // 2
+    return np.asarray(np.median(windows, axis=-1)[np.clip(place, 0, len(windows) - 1)])
 
 
 def _check_cover(snippets: Sequence[SnippetPoses], count: int) -> None:

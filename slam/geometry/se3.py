@@ -101,6 +101,13 @@ def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> Floa
     return make(Rotation.from_rotvec(rotation_vector).as_matrix(), np.asarray(t_a_b, dtype=np.float64))
 
 
+def tangent(T_a_b: FloatArray) -> FloatArray:
+    """Rotation vector and translation ``(..., 6)`` of ``(..., 4, 4)``: GTSAM's order, for small differences."""
+    R = T_a_b[..., :3, :3].reshape(-1, 3, 3)
+    turned = Rotation.from_matrix(R).as_rotvec().reshape(*T_a_b.shape[:-2], 3)
+    return np.concatenate([turned, T_a_b[..., :3, 3]], axis=-1)
+
+
 def is_se3(T_a_b: FloatArray, tolerance: float = 1e-6) -> bool:
     """Whether every matrix of the stack is a finite rigid transform."""
     if T_a_b.shape[-2:] != (4, 4) or not np.isfinite(T_a_b).all():

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from erfsfm.common.progress import Progress, silent
 from erfsfm.mvs.refine import Decide
-from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Predictor, RelativePose
@@ -75,7 +74,6 @@ class SlamPipeline:
         predictor: Predictor,
         config: SlamConfig,
         progress: Progress = silent,
-        noise: PoseNoise | None = None,
         checkpoint: SessionCheckpoint | None = None,
         seed: int = 0,
         gps_track: GpsTrack | None = None,
@@ -87,14 +85,10 @@ class SlamPipeline:
             predictor: depth and snippet poses.
             config: of all parts.
             progress: called with the stage, done and total.
-            noise: of the snippet poses; None measures it against image geometry alone.
             checkpoint: measurements of the first frames of the sequence, whose images are then not read.
             seed: of all RANSAC draws.
             gps_track: positions of the drive.
         """
-        if noise is None:
-            logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
-        self._noise = noise
         self._sequence, self._predictor, self._config = sequence, predictor, config
         self._progress = progress
         self._checkpoint = checkpoint
@@ -150,7 +144,7 @@ class SlamPipeline:
         agreements = self._compared(drive, steps, state)
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
-        scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
+        scale, factors, T_odometry = self._measure(drive, steps, agreements)
         support = agreement.frame_support(range(len(drive)), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
@@ -199,14 +193,14 @@ class SlamPipeline:
         return compared if by_depth is None else [*compared, by_depth.required()]
 
     def _measure(
-        self, drive: Drive, T_network: FloatArray, by_lidar: Sequence[RelativePose], agreements: list[Agreement]
+        self, drive: Drive, by_lidar: Sequence[RelativePose], agreements: list[Agreement]
     ) -> tuple[Scale, list[RelativePose], FloatArray]:
         """Scale and factors of a completed drive, and the odometry ``(N, 4, 4)`` chained from the factors."""
         config = self._config
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
-        factors = make_factors(drive, scale, self._noise, config.pose_network, config.visual_odometry)
-        T_odometry = chain_odometry(factors, T_network, scale)
+        factors = make_factors(drive, scale, config.visual_odometry)
+        T_odometry = chain_odometry(factors, len(drive))
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(T_odometry)
             if isinstance(unit, ScaleEstimate) and isinstance(scale.estimate, ScaleEstimate):
@@ -218,7 +212,7 @@ class SlamPipeline:
                 T_odometry[:, :3, 3] *= unit.value
         if config.lidar.factors and scale.is_metric:
             factors = with_lidar(factors, by_lidar)
-            T_odometry = chain_odometry(factors, T_network, scale)
+            T_odometry = chain_odometry(factors, len(drive))
         return scale, factors, T_odometry
 
     def fuse(

@@ -11,7 +11,6 @@ import numpy as np
 from erfsfm.common.readers.camera_file import HIGHEST_M
 from erfsfm.common.readers.pinhole import impossible
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
@@ -54,7 +53,6 @@ class Slam:
         camera_height_m: float | None = None,
         update_frames: int = 10,
         sweep_frames: int = 0,
-        noise: PoseNoise | None = None,
         weights_sha256: str = "",
         seed: int = 0,
     ) -> None:
@@ -68,7 +66,6 @@ class Slam:
             update_frames: lengths of the last steps are solved after so many frames.
             sweep_frames: the whole drive is solved after so many frames, which takes longer the longer it is; 0: only
                 in ``close_loops``.
-            noise: of the snippet poses; None measures it against image geometry alone.
             weights_sha256: of the networks and the depth source, to refuse resuming a session of others.
             seed: of all RANSAC draws.
 
@@ -90,7 +87,7 @@ class Slam:
         self._weights_sha256 = weights_sha256
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed
-        self._pipeline = SlamPipeline(self._sequence, predictor, config, noise=noise, seed=seed)
+        self._pipeline = SlamPipeline(self._sequence, predictor, config, seed=seed)
         self._pipeline.require_possible()
         self._observer = self._observe(None)
         self._is_closed = False
@@ -124,7 +121,6 @@ class Slam:
             intrinsics,
             config,
             camera_height_m,
-            noise=networks.noise,
             weights_sha256=mixed_sha256(networks.sha256, source),
         )
 

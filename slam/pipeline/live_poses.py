@@ -11,7 +11,6 @@ from slam.config.sections import SlamConfig
 from slam.frontend.agreement import confidence_of_frames, frame_support
 from slam.frontend.factors import chain_odometry, scaled_steps
 from slam.frontend.gap_interpolation import complete_drive
-from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.geometry.se3 import FloatArray, invert
@@ -151,8 +150,7 @@ class LivePoses:
         self._unit = unit
         if by_keyframes:
             return
-        steps, T_network = scaled_steps(window, scale), chain_raw(window.snippets, len(window))
-        T_odometry = chain_odometry(steps, T_network, scale)
+        T_odometry = chain_odometry(scaled_steps(window, scale), len(window))
         kept = max(first, self._settled)
         T_window_camera = T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])

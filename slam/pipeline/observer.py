@@ -204,7 +204,7 @@ class Observer:
         if is_seen:
             self._depth_index, depth = index, self._networks.submit(predicted_depth, self._predictor, frame)
         if len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0):
-            snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames), not by_keyframes)
+            snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
         return PendingFrame(frame, depth, snippet, self._gate.state().standing)
 
     def _process_pending(self) -> None:

@@ -78,13 +78,13 @@ class SourcedPredictor:
             logger.warning("frame %d has no known depth in %s", self._unknown.pop(0), self._source.name, extra=COUNTED)
         return aligned.depth
 
-    def snippet(self, frames: Sequence[Frame], with_residuals: bool = True) -> SnippetPoses:
+    def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet in the unit of the target's depth, or the nearest known frame's.
 
         Raises:
             SlamError: no frame of the snippet has known depth.
         """
-        snippet = self._networks.snippet(list(frames), with_residuals)
+        snippet = self._networks.snippet(list(frames))
         if self._align != "none":
             return snippet
         by_distance = sorted(frames, key=lambda frame: (abs(frame.index - snippet.target), -frame.index))

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.inference import depth_at, limit_torch_threads
-from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
 
 
@@ -42,7 +40,6 @@ class NetworkPredictor:
         """
         self._networks = networks
         self._intrinsics = intrinsics
-        self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
         self._key = object()  # key of outputs kept in frames, which outlive the networks
         self.sources = networks.sources
 
@@ -55,22 +52,12 @@ class NetworkPredictor:
         height, width = frame.image.shape[:2]
         return depth_at(self._disparity(frame), height, width)
 
-    def snippet(self, frames: Sequence[Frame], with_residuals: bool = True) -> SnippetPoses:
-        """Poses of the sources of a snippet, and their residuals if wanted; the target is the middle frame."""
+    def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
+        """Poses of the sources of a snippet; the target is the middle frame."""
         T_source_target = self._networks.poses([self._prepared(frame) for frame in frames])
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
-        residuals = None
-        if with_residuals:
-            residuals = self._residuals(frames, self._disparity(frames[middle]), T_source_target)
-        return SnippetPoses(frames[middle].index, sources, T_source_target, residuals)
-
-    def _residuals(
-        self, frames: Sequence[Frame], disparity: NDArray[np.float32], T_source_target: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Photometric residual ``(N,)`` of each source, over the difference of the images."""
-        thumbnails = [frame.derived("thumbnail", partial(thumbnail, frame.grey)) for frame in frames]
-        return self._residual.ratios(thumbnails, disparity, T_source_target)
+        return SnippetPoses(frames[middle].index, sources, T_source_target)
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:
         return frame.derived((self._key, "disparity"), lambda: self._networks.disparity(self._prepared(frame)))

@@ -29,7 +29,7 @@ class Recording(Record):
 
 
 class Provenance(Record):
-    """Version, command, weights and their training data, the noise model beside them, and where depth comes from."""
+    """Version, command, weights and their training data, and where depth comes from."""
 
     version: Known[str] = MISSING
     commit: Known[str] = MISSING
@@ -38,7 +38,6 @@ class Provenance(Record):
     device: Known[str] = MISSING
     weights: Known[str] = MISSING
     weights_sha256: Known[str] = MISSING
-    noise_sha256: Known[str] = MISSING
     weights_licence: Known[str] = MISSING
     trained_on: Known[list[str]] = MISSING
     leak: Known[bool] = MISSING

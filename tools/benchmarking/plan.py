@@ -64,7 +64,6 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no sigma by neighbouring steps": _NO_NEIGHBOURS,
     "no inflation of step sigmas": (*_NO_JITTER, *_NO_TURNS, *_NO_NEIGHBOURS),
     "no gap interpolation": ("gaps.enabled=false",),
-    "network factors only where image geometry fails": ("pose_network.use=gaps",),
     "no loops": ("loops.enabled=false",),
     "no consistency among loops": ("loops.min_support=0",),
     "no robust kernel": ("pose_graph.kernel=none",),

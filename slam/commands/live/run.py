@@ -86,7 +86,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     networks.depth(blank)  # both are loaded before images come
     networks.poses([blank] * (networks.sources + 1))
     sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
-    pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
+    pipeline = SlamPipeline(sequence, predictor, settings, seed=request.seed)
     poses = LivePoses(predictor.sources, sequence.camera_height_m, settings)
     session = _Session(sequence, poses, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(

@@ -114,15 +114,6 @@ def require_other_output(continues: Path, output: Path | None) -> None:
         )
 
 
-def warn_of_other_noise(folder: Path, before: Provenance | Missing, now: Provenance) -> None:
-    """Say that a run had another noise model: its whole drive is solved by the new one."""
-    is_known = known(before.version) is not None  # not where a killed run left no metrics.json
-    if is_known and known(before.noise_sha256) != known(now.noise_sha256):
-        logger.warning(
-            "noise.yaml of the weights is not that of %s: the whole drive is solved with the new one", folder
-        )
-
-
 def recording_to_resume(folder: Path) -> FrameSequence | None:
     """The drive of a live run up to its last kept state, for its images are gone; None of another run.
 

@@ -22,7 +22,6 @@ from slam.commands.run.continuation import (
     settings_to_resume,
     state_to_continue,
     state_to_resume,
-    warn_of_other_noise,
 )
 from slam.commands.run.job import Job, complete
 from slam.commands.run.request import RunRequest
@@ -39,7 +38,6 @@ from slam.results.run_log import run_log
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import from_anywhere
-from slam.runtime.storage.record import MISSING, Missing
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt, undistortion_of
 from slam.sequences.gps import read_gps
@@ -87,7 +85,6 @@ def perform(request: RunRequest) -> RunFolder:
 
 def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
     """Check everything, then make the folder of a new run, or go on in that of one that did not end."""
-    before: Provenance | Missing = MISSING
     if request.continues is not None:
         _, metrics = RunFolder.open_with_metrics(request.continues)
         provenance = provenance_to_resume(request.continues, metrics, request.output, request.recording)
@@ -101,18 +98,14 @@ def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
             )
         require_other_output(request.continues, request.output)
         gps, seed = inputs_to_continue(request.continues, metrics, request.gps, request.seed)
-        before = metrics.provenance
         request = replace(request, gps=gps, seed=seed)
     job = _prepare(request)
-    if request.continues is not None:
-        warn_of_other_noise(request.continues, before, job.provenance)
     return job, RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name, lock)
 
 
 def _resume(request: RunRequest, place: Path, before: Provenance) -> tuple[Job, RunFolder]:
     """A run that did not end, on what it was run on, from its last kept state."""
     job = _prepare(request.resumed(before, place), place)
-    warn_of_other_noise(place, before, job.provenance)
     logger.info("the run in %s goes on at frame %d", place, job.pipeline.first)
     return job, RunFolder.resume(place)
 
@@ -147,7 +140,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
         )
     predictor = make_predictor(networks, source, settings.depth, recording.intrinsics)
     rest = checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
-    pipeline = SlamPipeline(recording, predictor, settings, request.progress or silent, networks.noise, *rest)
+    pipeline = SlamPipeline(recording, predictor, settings, request.progress or silent, *rest)
     pipeline.require_possible()
     provenance = provenance_of(request, networks, recording, source)
     settings = _settings_from_anywhere(settings)
@@ -192,7 +185,6 @@ def provenance_of(
         device=str(networks.device),
         weights=from_anywhere(request.weights) if is_folder else request.weights,
         weights_sha256=networks.sha256,
-        noise_sha256=networks.noise_sha256 or Missing("no noise.yaml was measured with these weights"),
         weights_licence=networks.record.licence,
         trained_on=networks.record.trained_on,
         leak=bool(networks.leaks(recording.provenance())),

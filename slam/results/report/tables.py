@@ -90,7 +90,6 @@ def what_ran(metrics: Metrics) -> Table:
         return missing or f"{written(value, decimals)[:most]}{unit}"
 
     sequence, ran = metrics.sequence, metrics.provenance
-    noise = text(ran.noise_sha256, most=16)
     rows = [
         ("Sequence", f"{text(sequence.name)}, {text(sequence.frames)} frames"),
         ("Interpolated frames", _stretches(sequence.bridged) or "none"),
@@ -101,7 +100,6 @@ def what_ran(metrics: Metrics) -> Table:
         ("Scale", _scale(metrics)),
         ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
         ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
-        ("Noise of the poses", noise if DASH in noise else f"noise.yaml, sha256 {noise}"),
         ("Depth", _depth_source(metrics)),
         ("Licence of the weights", text(ran.weights_licence)),
         ("Trained on", _shortened(list(ran.trained_on)) or DASH),

@@ -25,8 +25,6 @@ from erfsfm.config import load_experiment
 from erfsfm.convert import read_old
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import read_split_file
-from erfsfm.inference import DepthPosePredictor
-from erfsfm.pose_noise import PoseNoise, read_pose_noise, write_pose_noise
 from slam import run_slam
 from slam.config.sections import load_config
 from slam.formats.ply import coloured_ply, read_ply, write_ply
@@ -59,10 +57,6 @@ def _is_trajectory(trajectory: Trajectory) -> bool:
 def _is_sequence(sequence: Any) -> bool:
     poses = sequence.reference
     return bool((np.diff(sequence.stamps) > 0).all()) and (poses is None or se3.is_se3(poses, tolerance=1e-3))
-
-
-def _is_noise(noise: PoseNoise | None) -> bool:
-    return noise is None or bool(np.isfinite(noise.coefficients).all())
 
 
 def _odometry_poses(path: Path) -> Any:
@@ -106,7 +100,6 @@ READERS = (
     Reader("PLY", "mesh.ply", read_ply, lambda ply: bool(np.isfinite(ply.points).all())),
     Reader("model.yaml", "weights/model.yaml", lambda path: load_model(path.parent)),
     Reader("safetensors", "weights/depth.safetensors", lambda path: load_model(path.parent)),
-    Reader("noise.yaml", "weights/noise.yaml", lambda path: read_pose_noise(path.parent), _is_noise),
     Reader("checkpoint of SfMLearner", "old.pth.tar", read_old),
 )
 
@@ -140,10 +133,6 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     shutil.copy(Path(__file__).parents[3] / "configs/erfsfm/tiny.yaml", place / "training.yaml")
     triangle = np.eye(3)
     write_ply(place / "mesh.ply", coloured_ply(triangle, triangle, triangle, np.array([[0, 1, 2]])))
-    sha256 = DepthPosePredictor.from_weights(place / "weights", "cpu").pose_sha256
-    six = (0.1,) * 6
-    known = {"frame": six, "turn": six, "length": six, "disagreement": six, "residual": six, "correlation": six}
-    write_pose_noise(place / "weights", PoseNoise(**known, pose_sha256=sha256, measured_on=["simulated/1"], pairs=9))
     _write_old_checkpoint(place / "old.pth.tar")
     overrides = ["output.keep=keyframes", "output.report=false", "visual_odometry.enabled=false"]
     run_slam(kitti_root, "sim", weights=tiny_weights, output=place / "run", frames="0:8", overrides=overrides)

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from erfsfm.pose_noise import PoseNoise
-from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
@@ -20,16 +19,6 @@ from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
 
 FRAMES = 12
 METRES = 4.0  # per unscaled length
-NOISE = PoseNoise(
-    frame=(0.01,) * 6,
-    turn=(0.0,) * 6,
-    length=(0.0,) * 6,
-    disagreement=(0.0,) * 6,
-    correlation=(0.5,) * 6,
-    pose_sha256="",
-    measured_on=["simulated/600"],
-    pairs=990,
-)
 
 
 def drive(step: float = 1.0) -> FloatArray:
@@ -62,11 +51,8 @@ def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
     return Scale("camera-height", MeasurementFailure("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit")
 
 
-def factors(
-    measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = (), use: str = "calibrated", noise=NOISE
-) -> list[RelativePose]:
-    found = make_factors(measured, scale, noise, PoseNetworkConfig(use=use), VisualOdometryConfig())
-    return with_lidar(found, lidar)
+def factors(measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = ()) -> list[RelativePose]:
+    return with_lidar(make_factors(measured, scale, VisualOdometryConfig()), lidar)
 
 
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]
@@ -103,42 +89,36 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
     assert found[1, 2].student_t_dof == np.inf
 
 
-@pytest.mark.parametrize(("use", "noise"), [("gaps", NOISE), ("calibrated", None), ("calibrated", NOISE)])
-def test_network_factors_are_used_where_no_path_of_steps_exists(use: str, noise: PoseNoise | None) -> None:
-    found = factors(Drive(motions=motions(STEPS, TRUE), trusted=snippets(TRUE)), scale(), use=use, noise=noise)
-    pairs = {tuple(sorted(f.ends)) for f in found if f.source == NETWORK_SOURCE}
-    assert {(2, 3), (3, 4), (4, 5), (2, 4), (3, 5), (7, 8), (7, 9), (6, 8)} <= pairs
-    assert not pairs & {(0, 1), (1, 2), (0, 2), (5, 6), (6, 7), (5, 7), (8, 9)}
+def test_the_network_has_a_factor_on_every_step() -> None:
+    found = factors(Drive(motions=motions(STEPS, TRUE), trusted=snippets(TRUE)), scale())
+    assert [f.ends for f in found if f.source == NETWORK_SOURCE] == [(k, k + 1) for k in range(FRAMES - 1)]
 
 
-def network_trajectory() -> FloatArray:
-    """Unscaled, and with the opposite rotation, so that its steps can be recognised."""
-    turns = np.tile([0.0, -0.1, 0.0], (FRAMES - 1, 1))
-    return chain(from_rotation_vector(turns, np.tile([0.0, 0.0, 0.5], (FRAMES - 1, 1))))
+def by_network() -> list[RelativePose]:
+    """With the opposite rotation, so that its steps can be recognised."""
+    return [RelativePose(k, k + 1, T_OF_NETWORK, np.full(6, 0.1), NETWORK_SOURCE) for k in range(FRAMES - 1)]
+
+
+T_OF_NETWORK = from_rotation_vector(np.array([0.0, -0.1, 0.0]), np.array([0.0, 0.0, 0.5 * METRES]))
 
 
 def test_odometry_chains_steps_that_skip_frames() -> None:
     """Frames 3 and 4 lie inside of a step and are chained by the network; frame 5 is chained to frame 2."""
-    T = chain_odometry([pose(*ends) for ends in STEPS], network_trajectory(), scale())
+    T = chain_odometry([*(pose(*ends) for ends in STEPS), *by_network()], FRAMES)
     for k in (0, 1, 2, 5, 6, 7):
         np.testing.assert_allclose(T[k], TRUE[k], atol=1e-9)
-    T_step = from_rotation_vector(np.array([0.0, -0.1, 0.0]), np.array([0.0, 0.0, 0.5 * METRES]))
-    np.testing.assert_allclose(T[3], T[2] @ T_step, atol=1e-9)
-    np.testing.assert_allclose(T[4], T[3] @ T_step, atol=1e-9)
-    np.testing.assert_allclose(T[8], T[7] @ T_step, atol=1e-9)
+    np.testing.assert_allclose(T[3], T[2] @ T_OF_NETWORK, atol=1e-9)
+    np.testing.assert_allclose(T[4], T[3] @ T_OF_NETWORK, atol=1e-9)
+    np.testing.assert_allclose(T[8], T[7] @ T_OF_NETWORK, atol=1e-9)
     np.testing.assert_allclose(T[9], T[8] @ pose(8, 9).T_from_to, atol=1e-9)
-    np.testing.assert_allclose(T[11], T[9] @ T_step @ T_step, atol=1e-9)
+    np.testing.assert_allclose(T[11], T[9] @ T_OF_NETWORK @ T_OF_NETWORK, atol=1e-9)
 
 
 def test_odometry_takes_the_step_from_the_nearest_frame_and_the_last_of_these() -> None:
     wrong = drive(3.0)
     mixed = [pose(0, 2, T=wrong), pose(1, 2, T=wrong), pose(1, 2), pose(0, 1), pose(0, 2, T=wrong)]
-    np.testing.assert_allclose(chain_odometry(mixed, network_trajectory(), scale())[2], TRUE[2], atol=1e-9)
+    np.testing.assert_allclose(chain_odometry(mixed, 3)[2], TRUE[2], atol=1e-9)
 
 
-def test_odometry_without_geometry_is_the_scaled_network() -> None:
-    T_network = network_trajectory()
-    by_network = [pose(0, 1, NETWORK_SOURCE)]
-    T = chain_odometry(by_network, T_network, scale())
-    np.testing.assert_allclose(T[:, :3, 3], METRES * T_network[:, :3, 3], atol=1e-9)
-    np.testing.assert_allclose(T[:, :3, :3], T_network[:, :3, :3], atol=1e-9)
+def test_odometry_without_geometry_is_the_network() -> None:
+    np.testing.assert_allclose(chain_odometry(by_network(), FRAMES), chain(np.tile(T_OF_NETWORK, (FRAMES - 1, 1, 1))))

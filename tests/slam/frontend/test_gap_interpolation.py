@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps, network_steps
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
@@ -71,6 +70,20 @@ def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]) -> None:
     linked = {f.from_index for f in found.gap_steps}
     linked |= {step for s in found.trusted for step in range(min(s.sources), max(s.sources))}
     assert linked == set(range(COUNT - 1))
+
+
+def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth() -> None:
+    """The network's lengths are three quarters of those by learned depth."""
+    short = steady()
+    short[:, :3, 3] *= 0.75
+    steps = [measured(steady(), k, k + 1) for k in (*range(14), *range(26, COUNT - 1))]
+    unusable = set(range(17, 23))
+    found = interpolate_gaps(
+        collected(snippets_of(short, unusable), steps, unusable=dict.fromkeys(unusable, "black")), 4
+    )
+    for factor in found.gap_steps:
+        np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
+    np.testing.assert_allclose(chain_raw(found.snippets, COUNT), short, atol=1e-9)
 
 
 def test_the_motion_changes_evenly_from_before_to_after() -> None:
@@ -147,13 +160,3 @@ def test_without_any_snippet_there_is_one_error() -> None:
     reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
     with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"):
         interpolate_gaps(collected([], unusable=reasons), 4)
-
-
-def test_steps_are_the_direct_poses_of_the_target() -> None:
-    first, second = snippet(steady(), 2), snippet(steady(), 3)
-    bent = second.T_source_target.copy()
-    bent[2, 0, 3] += 0.1  # source 4, the next of target 3
-    steps = network_steps([first, replace(second, T_source_target=bent)])
-    assert sorted(steps) == [0, 1, 2, 3, 4]
-    np.testing.assert_allclose(steps[2], STEP, atol=1e-12)
-    np.testing.assert_allclose(steps[3], invert(bent[2]), atol=1e-12)

@@ -1,26 +1,24 @@
-"""The pose network's snippets as factors with their noise, and as the raw trajectory."""
+"""The pose network's steps as factors in a measured unit with a measured noise, and as the raw trajectory."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from erfsfm.pose_noise import PoseNoise
+from slam.config.sections import PoseGraphConfig
+from slam.evaluation.coverage import coverage
 from slam.frames import RelativePose, SnippetPoses
-from slam.frontend.network_factors import (
-    UncalibratedNoise,
-    calibrated_factors,
-    chain_raw,
-    measured_noise,
-    network_factors,
-    without_measured,
-)
+from slam.frontend.network_factors import calibrate_network, chain_raw, network_factors, network_steps
 from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.graph.pose_graph import PoseGraph
 from slam.runtime.errors import SlamError
 
-USUAL = UncalibratedNoise()
+COUNT = 300
+UNIT = 0.75  # of learned depth per unit of the network
+METRES = 1.6  # per unit of learned depth
+ROTATION, TRANSLATION = np.deg2rad(0.1), 0.08  # sigmas of a step of the network, the latter over its length
+DEPTH_UNIT = np.full(COUNT, METRES)
 
 
 def drive(count: int) -> np.ndarray:
@@ -63,6 +61,20 @@ def test_chain_uses_target_to_next_and_nothing_else():
     np.testing.assert_allclose(se3.invert(chained[10]) @ chained[9], last.T_source_target[2], atol=1e-9)
 
 
+def test_a_step_that_several_snippets_see_is_their_mean():
+    T, rng = drive(200), np.random.default_rng(3)
+    snippets = snippets_of(T)
+    for snippet in snippets:
+        snippet.T_source_target[:, :3, 3] += 0.1 * rng.normal(size=(4, 3))
+    raw, steps, true = chain_raw(snippets, 200), network_steps(snippets), se3.invert(T[:-1]) @ T[1:]
+    assert list(steps) == list(range(199))
+    single, mean = (
+        np.square(found[:, :3, 3] - true[:, :3, 3]).mean()
+        for found in (se3.invert(raw[:-1]) @ raw[1:], np.array(list(steps.values())))
+    )
+    assert mean < 0.6 * single
+
+
 def test_sequences_that_snippets_do_not_cover_are_refused():
     snippets = snippets_of(drive(12))
     with pytest.raises(SlamError, match="4 frames is shorter than one snippet"):
@@ -76,207 +88,109 @@ def test_sequences_that_snippets_do_not_cover_are_refused():
             chain_raw(snippets, count)
 
 
-def test_every_direct_pose_is_a_factor_in_its_own_direction():
-    T = drive(10)
-    factors = network_factors(snippets_of(T), USUAL)
-    assert len(factors) == 4 * 6
-    for factor in factors:
-        expected = se3.invert(T[factor.from_index]) @ T[factor.to_index]
-        np.testing.assert_allclose(factor.T_from_to, expected, atol=1e-12)
-        assert 2 <= factor.to_index <= 7  # the target
+def seen_by_network(T: FloatArray, unit: FloatArray | float = UNIT, seed: int = 0) -> dict[int, FloatArray]:
+    """Steps in a unit ``(N - 1,)`` of their own, with noise in proportion to the usual length."""
+    rng, count = np.random.default_rng(seed), len(T) - 1
+    steps = se3.invert(T[:-1]) @ T[1:]
+    noise = rng.normal(size=(count, 6)) * np.repeat([ROTATION, TRANSLATION], 3)
+    steps = steps @ se3.from_rotation_vector(noise[:, :3], noise[:, 3:])
+    steps[:, :3, 3] /= np.broadcast_to(METRES * unit, count)[:, None]
+    return dict(enumerate(steps))
 
 
-def test_noise_follows_distance_length_and_repetition():
-    T = np.tile(np.eye(4), (10, 1, 1))
-    T[:, 2, 3] = 2.0 * np.arange(10)
-    sigmas = {(f.from_index, f.to_index): f.sigmas for f in network_factors(snippets_of(T), USUAL)}
-    once, twice = np.deg2rad(0.3), np.deg2rad(0.3) * np.sqrt(2)
-    # pair (0, 2) is measured once, pair (4, 5) by two snippets
-    np.testing.assert_allclose(sigmas[0, 2][:3], once * np.sqrt(2))
-    np.testing.assert_allclose(sigmas[4, 5][:3], twice)
-    np.testing.assert_allclose(sigmas[4, 5][3:], np.sqrt(2) * (0.1 * 2.0 + 0.05 * 2.0))
-    np.testing.assert_allclose(sigmas[4, 6][3:], np.sqrt(2) * (0.1 * 4.0 + 0.05 * 2.0))
-    np.testing.assert_array_equal(sigmas[5, 4], sigmas[4, 5])
-
-
-def test_standing_still_keeps_positive_sigmas():
-    for factor in network_factors(snippets_of(np.tile(np.eye(4), (8, 1, 1))), USUAL):
-        assert (factor.sigmas > 0).all()
-
-
-def geometry_of(T) -> list[RelativePose]:
-    steps = zip(range(len(T) - 1), se3.invert(T[:-1]) @ T[1:])
-    return [RelativePose(k, k + 1, T_k_next, np.full(6, 1e-3), "essential") for k, T_k_next in steps]
-
-
-def test_noise_is_estimated_where_geometry_measured_the_same_steps():
-    T, sigma_deg = drive(300), 2.0
+def measured(T: FloatArray, frames: range = range(COUNT - 1), reach: int = 1) -> list[RelativePose]:
+    """By image geometry in metres, with lengths to 2 %."""
     rng = np.random.default_rng(1)
-    snippets = snippets_of(T)
-    for snippet in snippets:
-        for pose in snippet.T_source_target:
-            turn = np.deg2rad(sigma_deg) * rng.normal(size=3)
-            pose[:] = pose @ se3.from_rotation_vector(turn, np.zeros(3))
-    measured = measured_noise(snippets, geometry_of(T))
-    assert measured.rotation_sigma_deg == pytest.approx(sigma_deg, rel=0.15)
-    assert measured.translation_relative_sigma == USUAL.translation_relative_sigma
+    found = []
+    for k in frames[: len(frames) + 1 - reach : reach]:
+        T_from_to = se3.invert(T[k]) @ T[k + reach]
+        T_from_to[:3, 3] *= 1 + 0.02 * rng.normal()
+        sigmas = np.r_[np.full(3, 2e-4), np.full(3, 0.02 * np.linalg.norm(T_from_to[:3, 3]))]
+        found.append(RelativePose(k, k + reach, T_from_to, sigmas, "essential"))
+    return found
 
 
-def test_noise_stays_as_usual_where_the_network_is_better_or_geometry_measured_little():
-    T = drive(60)
-    assert measured_noise(snippets_of(T), geometry_of(T)) == USUAL
-    assert measured_noise(snippets_of(T, wrong=5.0), geometry_of(T)[:3]) == USUAL
+@pytest.mark.parametrize("reach", [1, 2])
+def test_unit_and_noise_of_the_network_are_measured_on_the_drive(reach: int) -> None:
+    T = drive(COUNT)
+    found = calibrate_network(seen_by_network(T), measured(T, reach=reach), DEPTH_UNIT)
+    assert np.median(found.unit) == pytest.approx(METRES * UNIT, rel=0.01)
+    np.testing.assert_allclose(found.unit, METRES * UNIT, rtol=0.08)
+    rotation, translation = (np.median(found.sigmas[:, part]) for part in (slice(3), slice(3, 6)))
+    # the errors here are independent: over two steps they are smaller in proportion
+    assert rotation == pytest.approx(ROTATION / np.sqrt(reach), rel=0.15)
+    assert translation == pytest.approx(TRANSLATION / np.sqrt(reach), rel=0.15)
 
 
-def test_network_factors_are_used_where_geometry_did_not_measure():
-    T = drive(20)
-    factors, geometric = network_factors(snippets_of(T), USUAL), geometry_of(T)
-    assert without_measured(factors, geometric) == []
-    assert without_measured(factors, []) == factors
-    gap = without_measured(factors, geometric[:9] + geometric[10:])
-    assert pairs_of(gap) == {(9, 10), (8, 10), (9, 11)}
+def test_the_unit_follows_the_drive() -> None:
+    T, unit = drive(COUNT), UNIT * np.exp(0.3 * np.sin(np.linspace(0, 4, COUNT - 1)))
+    found = calibrate_network(seen_by_network(T, unit), measured(T), DEPTH_UNIT)
+    np.testing.assert_allclose(found.unit[20:-20], METRES * unit[20:-19], rtol=0.1)
 
 
-def test_a_step_that_skips_frames_replaces_the_network_between_its_frames_alone():
-    """Geometry measured from frame 9 to 11 at once, and not the single steps between them."""
-    T = drive(20)
-    factors, geometric = network_factors(snippets_of(T), USUAL), geometry_of(T)
-    over_two = RelativePose(9, 11, se3.invert(T[9]) @ T[11], np.ones(6), "essential")
-    gap = without_measured(factors, [*geometric[:9], over_two, *geometric[11:]])
-    assert pairs_of(gap) == {(9, 10), (8, 10), (10, 11), (10, 12)}
-    beside = without_measured(factors, [*geometric[:9], over_two, *geometric[10:]])
-    assert pairs_of(beside) == {(9, 10), (8, 10)}
-    alone = without_measured(factors, [over_two])
-    assert len(factors) - len(alone) == 2 and (9, 11) not in pairs_of(alone)
+def test_a_third_of_wrong_steps_does_not_change_the_unit() -> None:
+    T = drive(COUNT)
+    geometric = [pose.scaled(3.0) if pose.from_index % 3 == 0 else pose for pose in measured(T)]
+    found = calibrate_network(seen_by_network(T), geometric, DEPTH_UNIT)
+    assert np.median(found.unit) == pytest.approx(METRES * UNIT, rel=0.06)
 
 
-def pairs_of(factors) -> set[tuple[int, int]]:
-    return {tuple(sorted(factor.ends)) for factor in factors}
+def test_with_few_measured_steps_lengths_are_those_of_learned_depth_and_uncertain() -> None:
+    T = drive(COUNT)
+    steps = seen_by_network(T)
+    for geometric in ([], measured(T, range(100, 119)), measured(np.tile(np.eye(4), (COUNT, 1, 1)))):
+        found = calibrate_network(steps, geometric, DEPTH_UNIT)
+        np.testing.assert_array_equal(found.unit, DEPTH_UNIT)
+        factor = network_factors(steps, found)[50]
+        assert factor.T_from_to[2, 3] == pytest.approx(METRES * steps[50][2, 3])
+        assert abs(UNIT - 1) * factor.T_from_to[2, 3] < 1.5 * factor.sigmas[5]
 
 
-NOISE = PoseNoise(
-    frame=(0.01,) * 6,
-    turn=(0.0,) * 6,
-    length=(0.0,) * 6,
-    disagreement=(0.0,) * 6,
-    correlation=(0.5,) * 6,
-    pose_sha256="",
-    measured_on=["simulated/600"],
-    pairs=990,
-)
+def test_a_gap_of_image_geometry_is_bridged_with_its_true_length() -> None:
+    T = drive(COUNT)
+    gaps = [range(k, k + 20) for k in range(30, 260, 45)]
+    geometric = [pose for pose in measured(T) if not any(pose.from_index in gap for gap in gaps)]
+    steps = seen_by_network(T)
+    factors = network_factors(steps, calibrate_network(steps, geometric, DEPTH_UNIT))
+    errors = []
+    for gap in gaps:
+        T_first_last = se3.chain(np.array([factors[k].T_from_to for k in gap]))[-1]
+        true = se3.invert(T[gap[0]]) @ T[gap[-1] + 1]
+        errors.append(np.linalg.norm(T_first_last[:3, 3]) / np.linalg.norm(true[:3, 3]) - 1)
+    assert np.abs(errors).max() < 0.1 and abs(np.mean(errors)) < 0.03
 
 
-def test_calibrated_noise_gives_each_pair_one_factor_with_any_overlap():
-    T = drive(10)
-    factors = {(f.from_index, f.to_index): f for f in calibrated_factors(snippets_of(T), [], NOISE)}
-    # targets 2 to 7: pairs of neighbours from (1, 2) to (7, 8), pairs over two from (0, 2) to (7, 9)
-    assert factors.keys() == {(k, k + 1) for k in range(1, 8)} | {(k, k + 2) for k in range(8)}
-    for (first, last), factor in factors.items():
-        np.testing.assert_allclose(factor.T_from_to, se3.invert(T[first]) @ T[last], atol=1e-9)
-    np.testing.assert_allclose(factors[1, 2].sigmas, 0.01)  # measured by the snippet of 2 alone
-    np.testing.assert_allclose(factors[4, 5].sigmas, 0.01 * np.sqrt(0.75))
-    np.testing.assert_allclose(factors[4, 6].sigmas, 0.02 * np.sqrt(0.75))
+def test_stated_noise_of_the_network_holds() -> None:
+    T, inside = drive(COUNT), []
+    for seed in range(3):
+        steps = seen_by_network(T, seed=seed)
+        factors = network_factors(steps, calibrate_network(steps, measured(T), DEPTH_UNIT))
+        inside.append(coverage(factors, T, 1.0).overall)
+    for level, least, most in (("50", 0.4, 0.65), ("90", 0.85, 0.97), ("95", 0.91, 0.99)):
+        assert least < np.mean([each[level] for each in inside]) < most
 
 
-def wobbling(T: np.ndarray, sigma: np.ndarray) -> list[SnippetPoses]:
-    """Snippets with pitch errors of ``sigma`` by target ``(N,)``, radians, two independent ones for every pair."""
-    rng, snippets = np.random.default_rng(1), snippets_of(T)
-    for snippet in snippets:
-        for pose in snippet.T_source_target:
-            wrong = np.array([sigma[snippet.target], 0.0, 0.0]) * rng.normal()
-            pose[:] = pose @ se3.from_rotation_vector(wrong, np.zeros(3))
-    return snippets
+def test_the_network_makes_no_drive_shorter() -> None:
+    T = drive(COUNT)
+    geometric, steps = measured(T), seen_by_network(T)
+    factors = network_factors(steps, calibrate_network(steps, geometric, DEPTH_UNIT))
+
+    def length(*factors: RelativePose) -> float:
+        graph = PoseGraph(PoseGraphConfig())
+        graph.add_relative(*factors)
+        return float(se3.path_distance(graph.optimise(T))[-1])
+
+    assert length(*factors, *geometric) == pytest.approx(length(*geometric), rel=1e-3)
 
 
-def sigmas_of(factors: list[RelativePose]) -> dict[tuple[int, int], np.ndarray]:
-    return {(f.from_index, f.to_index): f.sigmas for f in factors}
+def test_errors_that_last_count_less_in_the_graph() -> None:
+    T = drive(COUNT)
+    steps = seen_by_network(T)
+    for factor in network_factors(steps, calibrate_network(steps, measured(T), DEPTH_UNIT)):
+        assert (factor.graph_sigmas > 4 * factor.sigmas).all()
 
 
-def exact_geometry(T: np.ndarray) -> list[RelativePose]:
-    return [replace(g, sigmas=np.full(6, 1e-6)) for g in geometry_of(T)]
-
-
-def test_a_drive_scales_calibrated_noise_up_and_down():
-    T = drive(300)
-    snippets, promised = wobbling(T, np.full(300, 0.05)), 0.01 * np.sqrt(0.75)
-    scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE))
-    assert scaled[50, 51][0] == pytest.approx(0.05 / np.sqrt(2), rel=0.25)
-    assert scaled[50, 51][1] == pytest.approx(0.3 * promised, rel=1e-3)  # the lower limit, however well both agree
-    few = calibrated_factors(snippets, exact_geometry(T)[:9], NOISE)
-    np.testing.assert_allclose(sigmas_of(few)[50, 51], promised, rtol=1e-3)
-    assert {f.student_t_dof for f in few} == {np.inf}  # as calibrated
-
-
-def test_noise_that_a_short_drive_cannot_check_is_for_gaps_alone():
-    T = drive(21)
-    steps = exact_geometry(T)
-    assert calibrated_factors(snippets_of(T)[:15], steps, NOISE) == []
-    gap = calibrated_factors(snippets_of(T), steps[:8] + steps[9:], NOISE)
-    assert pairs_of(gap) == {(8, 9), (7, 9), (8, 10)}
-
-
-def test_steps_that_skip_frames_scale_the_noise_of_pairs_as_far_apart():
-    """Geometry leads over two frames at a time: pairs of neighbours keep the noise beside the weights."""
-    T = drive(300)
-    snippets = wobbling(T, np.full(300, 0.05))
-    over_two = [
-        RelativePose(k, k + 2, se3.invert(T[k]) @ T[k + 2], np.full(6, 1e-6), "essential") for k in range(0, 298, 2)
-    ]
-    scaled = sigmas_of(calibrated_factors(snippets, over_two, NOISE))
-    promised = 0.01 * np.sqrt(0.75)
-    np.testing.assert_allclose(scaled[50, 51], promised, rtol=1e-3)
-    single = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE))
-    for pair in ((50, 52), (51, 53)):  # steps begin at even frames, the scaling is that of the distance
-        assert scaled[pair][0] == pytest.approx(single[pair][0], rel=0.25)
-        assert scaled[pair][0] > 2 * promised
-
-
-def test_turns_are_scaled_apart_from_straights():
-    """A drive that turns from the middle on, where errors of the network are ten times as large."""
-    turns = np.where(np.arange(299) < 150, 0.0, 0.03) + 1e-4 * np.sin(np.arange(299))
-    steps = se3.from_rotation_vector(np.column_stack([0 * turns, turns, 0 * turns]), np.tile([0.0, 0.0, 1.0], (299, 1)))
-    T = se3.chain(steps)
-    snippets = wobbling(T, np.where(np.arange(300) < 150, 0.01, 0.1))
-    scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE))
-    straight, turning = ([scaled[k, k + 1][0] for k in r] for r in (range(20, 130), range(170, 280)))
-    assert np.median(turning) > 5 * np.median(straight)
-
-
-def test_noise_of_geometry_is_added_to_that_of_the_network():
-    T = drive(100)
-    geometric = [replace(g, sigmas=np.full(6, 0.4)) for g in geometry_of(T)]
-    factors = sigmas_of(calibrated_factors(snippets_of(T), geometric, NOISE))
-    np.testing.assert_allclose(factors[50, 51], 0.4, rtol=1e-2)
-    np.testing.assert_allclose(factors[50, 52], 0.4 * np.sqrt(2), rtol=1e-2)
-    without_one = sigmas_of(calibrated_factors(snippets_of(T), geometric[:50] + geometric[51:], NOISE))
-    np.testing.assert_allclose(without_one[50, 51], 0.4, rtol=1e-2)
-
-
-def test_equal_turn_rates_have_one_scaling():
-    T = se3.chain(se3.from_rotation_vector(np.zeros((99, 3)), np.tile([0.0, 0.0, 1.0], (99, 1))))
-    factors = sigmas_of(calibrated_factors(wobbling(T, np.zeros(100)), exact_geometry(T), NOISE))
-    np.testing.assert_allclose(factors[50, 51], 0.3 * 0.01 * np.sqrt(0.75), rtol=1e-3)
-
-
-def test_correlated_errors_get_larger_sigmas_in_the_graph():
-    """Errors of pitch are independent, those of roll are a bias of about the same size."""
-    rng, count = np.random.default_rng(2), 400
-    ahead = np.tile([0.0, 0.0, 1.0], (count - 1, 1))
-    T, wrong = se3.chain(se3.from_rotation_vector(0 * ahead, ahead)), 0.01 * rng.normal(size=(count - 1, 3))
-    wrong[:, 1], wrong[:, 2] = 0.0, 0.01 + 0.1 * wrong[:, 2]
-    seen = snippets_of(se3.chain(se3.from_rotation_vector(wrong, ahead)))
-    factors = calibrated_factors(seen, exact_geometry(T), NOISE)
-    longer = {
-        distance: np.median(
-            [f.graph_sigmas / f.sigmas for f in factors if f.to_index - f.from_index == distance], axis=0
-        )
-        for distance in (1, 2)
-    }
-    # pairs of both distances measure the same twice; a hundred equal errors add up to ten times independent ones
-    assert longer[1][0] == pytest.approx(np.sqrt(2), rel=0.3)
-    assert longer[2][0] == pytest.approx(np.sqrt(2) * np.sqrt(2), rel=0.3)  # neighbours share a step
-    assert longer[1][2] > 6 * np.sqrt(2) and longer[2][2] > 6 * np.sqrt(2)
-    few = calibrated_factors(seen, exact_geometry(T)[:30], NOISE)
-    for distance, pairs in ((1, 397), (2, 398)):  # too few to tell: taken to last for a quarter of the drive
-        ratios = [f.graph_sigmas / f.sigmas for f in few if f.to_index - f.from_index == distance]
-        np.testing.assert_allclose(ratios, np.sqrt(pairs // 4) * np.sqrt(2))
+def test_standing_still_keeps_positive_sigmas() -> None:
+    steps = network_steps(snippets_of(np.tile(np.eye(4), (8, 1, 1))))
+    for factor in network_factors(steps, calibrate_network(steps, [], np.ones(8))):
+        assert (factor.sigmas > 0).all()

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from oracle import OracleNoise, OraclePredictor
 
-from erfsfm.model_record import find_weights
-from erfsfm.pose_noise import file_sha256
 from slam import Slam, run_slam
 from slam.config.sections import load_config
 from slam.frames import Frame
@@ -31,7 +29,6 @@ SAME = (
     *("reference.tum.txt", "graph.g2o", "loops.json", "places.npz", "map_mesh.ply", "map_cloud.ply"),
 )
 WEIGHTS = "sim"
-NO_NOISE = "no noise.yaml was measured with these weights"
 SETTINGS = ["output.report=false", "output.keep=keyframes", "mapping.min_weight=1"]
 
 
@@ -205,28 +202,6 @@ def test_configuration_of_the_pass_over_the_frames_is_fixed(
 def test_other_weights(go_on: Callable[..., RunFolder]) -> None:
     with pytest.raises(SlamError, match="was run with other weights"):
         go_on(weights="default")
-
-
-@pytest.mark.slow
-def test_the_noise_of_the_poses_is_named_and_another_one_is_said(
-    kitti_root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    weights = Path(shutil.copytree(find_weights(WEIGHTS), tmp_path / "weights"))
-    options: dict[str, Any] = {
-        "weights": weights,
-        "overrides": ["visual_odometry.enabled=false", "mapping.enabled=false"],
-    }
-    before = run(kitti_root, tmp_path / "before", "0:8", **options)
-    sha256 = before.metrics().tree()["provenance"]["noise_sha256"]
-    assert sha256 == file_sha256(weights / "noise.yaml")
-    assert sha256[:16] in (before.path / "report.html").read_text()
-    options |= {"overrides": (), "continues": before.path}
-    run(kitti_root, tmp_path / "same", "8:", **options)
-    assert "noise.yaml of the weights is not that of" not in caplog.text
-    (weights / "noise.yaml").unlink()
-    provenance = run(kitti_root, tmp_path / "other", "8:", **options).metrics().tree()["provenance"]
-    assert "noise.yaml of the weights is not that of" in caplog.text
-    assert (provenance["noise_sha256"], provenance["noise_sha256_reason"]) == (None, NO_NOISE)
 
 
 def test_another_camera(go_on: Callable[..., RunFolder], tmp_path: Path) -> None:

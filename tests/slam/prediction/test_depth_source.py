@@ -29,11 +29,11 @@ class Networks:
     def depth(self, frame: Frame) -> DepthMap:
         return np.asarray(1 / SCENE, np.float32)
 
-    def snippet(self, frames: list[Frame], with_residuals: bool = True) -> SnippetPoses:
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
         T_source_target = np.tile(np.eye(4), (4, 1, 1))
         T_source_target[:, 2, 3] = 1.0
         indices = [frame.index for frame in frames]
-        return SnippetPoses(indices.pop(2), tuple(indices), T_source_target, np.full(4, 0.5))
+        return SnippetPoses(indices.pop(2), tuple(indices), T_source_target)
 
     def executor(self) -> Executor:
         return ThreadPoolExecutor(1)
@@ -69,7 +69,6 @@ def test_poses_get_the_unit_of_a_source_with_one_unit(gain: float) -> None:
     snippet = both.snippet(frames())
     np.testing.assert_allclose(shifts(snippet), 1 / gain, rtol=1e-5)
     assert (snippet.target, snippet.sources) == (2, (0, 1, 3, 4))
-    assert snippet.residuals is not None and (snippet.residuals == 0.5).all(), "they are the networks' own"
     np.testing.assert_array_equal(snippet.T_source_target[:, :3, :3], np.tile(np.eye(3), (4, 1, 1)))
 
 

@@ -25,7 +25,7 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.geometry.se3 import FloatArray, invert, rigid
+from slam.geometry.se3 import FloatArray, compose, invert, rigid
 
 
 def make_factors(
@@ -120,7 +120,7 @@ def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale
         before[k - 1], increments[k - 1] = step.from_index, step.T_from_to
     T_world_camera = np.tile(np.eye(4), (len(T_network), 1, 1))
     for k, (first, T_first_camera) in enumerate(zip(before.tolist(), rigid(increments), strict=True), start=1):
-        np.matmul(T_world_camera[first], T_first_camera, out=T_world_camera[k])
+        T_world_camera[k] = compose(T_world_camera[first], T_first_camera)
     return T_world_camera
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -14,14 +14,17 @@ from erfsfm.mvs.refine import Decide
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame, Predictor, RelativePose
+from slam.frames import Frame, Predictor, RelativePose, View
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.lidar_odometry import LIDAR_SOURCE, lidar_path, usable_steps
+from slam.frontend.gap_interpolation import complete_drive
+from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.relative_poses import keyframe_poses
+from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale, find_scale, height_by_lidar
 from slam.frontend.scale.scale_estimate import (
@@ -44,16 +47,50 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.input_checks import require_possible
 from slam.pipeline.keyframe_depth import ROOM_SIGMA, KeyframeDepths
-from slam.pipeline.map_closure import MapClosure
+from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
+from slam.runtime.attempt import attempt
 from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d_beside
+from slam.runtime.storage.record import Missing
 from slam.runtime.threads import CORES, read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.sequences.continued import Continued
 
 logger = logging.getLogger(__name__)
+
+
+Keep = Callable[[str, Trajectory], None]
+
+
+def _keep_nothing(name: str, trajectory: Trajectory) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """A completed drive, its lengths and factors, and ``T_world_camera`` ``(N, 4, 4)`` chained from these."""
+
+    drive: Drive
+    scale: Scale
+    factors: list[RelativePose]
+    T_world_camera: FloatArray
+    agreements: Sequence[Agreement]
+
+    def views(self) -> list[View]:
+        """Those of the drive, their points in the unit of the trajectory."""
+        return [view.scaled(float(self.scale.per_frame[view.index])) for view in self.drive.views]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the pose graph gives, or why there is none: ``T_world_camera`` ``(N, 4, 4)`` then is the odometry."""
+
+    graph: PoseGraph | Missing
+    T_world_camera: FloatArray
+    loops: LoopClosures
+    location: Location | MeasurementFailure | None
 
 
 def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
@@ -108,8 +145,7 @@ class SlamPipeline:
         """Run the whole system.
 
         Raises:
-            SlamError: the sequence is too short, unreadable or lacks what the scale mode needs, or the graph has no
-                solution.
+            SlamError: the sequence is too short, unreadable or lacks what the scale mode needs.
         """
         estimate = self.estimate()
         return replace(estimate, map=self.fuse(estimate))
@@ -119,6 +155,7 @@ class SlamPipeline:
         checkpoints: CheckpointWriter | None = None,
         frames: Iterator[Frame] | None = None,
         watch: Callable[[Observer], None] | None = None,
+        keep: Keep = _keep_nothing,
     ) -> Estimate:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
 
@@ -126,66 +163,130 @@ class SlamPipeline:
             checkpoints: keeps the state of the pass, given to it every 100 frames.
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
+            keep: as in `solve`.
         """
         self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        drive, closure, state = self._observe(checkpoints, frames, watch)
+        maps, state = self._observe(checkpoints, frames, watch)
         self._progress("loops and graph", 0, 1)
-        warn_of_doubts(drive, state.gate)
-        estimate = self.solve(drive, closure, state)
+        estimate = self.solve(maps, state, keep)
+        warn_of_doubts(estimate.drive, state.gate)
+        if isinstance(self._sequence, Continued):
+            warn_of_another_place(estimate.drive, self.first)
         self._progress("loops and graph", 1, 1)
         return estimate
 
-    def solve(self, drive: Drive, closure: MapClosure, state: FrontEndState) -> Estimate:
-        """Lengths, factors and loops of a completed drive and its closed maps, and the trajectory that fits them.
+    def solve(self, maps: Sequence[MapSegment], state: FrontEndState, keep: Keep = _keep_nothing) -> Estimate:
+        """Lengths, factors and loops of a drive, and the trajectory that fits them.
+
+        An error in the search for loops costs the loops, one in the graph the loops and the graph: the optimised
+        trajectory then is the odometry.
+
+        Args:
+            maps: of keyframes; none of a drive that is measured by steps alone.
+            state: after the last frame.
+            keep: given each trajectory by its name as soon as it is known: all but the last before loops are sought.
 
         Raises:
-            SlamError: the graph has no solution.
+            SlamError: no snippet of usable frames, or a source of lengths that contradicts the images.
         """
-        T_network = chain_raw(drive.snippets, len(drive))
+        reference = None if self._sequence.reference is None else self._trajectory(self._sequence.reference)
+        if reference is not None:
+            keep("reference", reference)
+        with self._watch.stage("geometry"):
+            poses = keyframe_poses(maps, self._sequence.intrinsics, self._seed)
+        drive = self._completed(maps, state, MapClosure(poses))
+        network = self._trajectory(chain_raw(drive.snippets, len(drive)))
+        keep("network", network)
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence, self._progress)
         steps = usable_steps(lidar, are_needed=self.mode == "lidar")
         agreements = self._compared(drive, steps, state)
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
-        scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
+        with self._watch.stage("scale"):
+            scale = find_scale(self.mode, self._sequence.camera_height_m, drive, steps, self._config.lengths)
+
+        def chained(drive: Drive) -> Odometry:
+            return self._chained(drive, network.T_world_camera, scale, steps)
+
+        odometry = chained(drive)
+        keep("odometry", self._trajectory(odometry.T_world_camera))
+        with self._watch.stage("loops"):
+            found = attempt("loop closure", lambda: self._closed(odometry, maps, state, chained))
+        odometry, loops = (odometry, LoopClosures(not_sought=found.reason)) if isinstance(found, Missing) else found
+        location = (
+            None
+            if self._positioning is None
+            else self._positioning.locate(odometry.T_world_camera, odometry.scale.estimate)
+        )
+        solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
+        if isinstance(solved, Missing):
+            solved = Solution(solved, odometry.T_world_camera, LoopClosures(not_sought=solved.reason), location)
+        return self._estimate(state, reference, network, lidar, odometry, solved, agreements)
+
+    def _estimate(
+        self,
+        state: FrontEndState,
+        reference: Trajectory | None,
+        network: Trajectory,
+        lidar: LidarPath | MeasurementFailure | None,
+        odometry: Odometry,
+        solved: Solution,
+        agreements: Sequence[Agreement],
+    ) -> Estimate:
+        """All of it, with what follows for its confidence."""
+        drive, scale = odometry.drive, odometry.scale
+        by_sources = [*agreements, *odometry.agreements]
+        if self._positioning is not None and self._positioning.agreement is not None:
+            by_gps = self._positioning.agreement
+            by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
         support = agreement.frame_support(range(len(drive)), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
-        views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
-        if drive.maps and self._config.loops.enabled:
-            loops = closure.closures(scale)
-        else:
-            with self._watch.stage("loops"):
-                camera, config = self._sequence.intrinsics, self._config.loops
-                loops = close_loops(views, T_odometry, camera, config, scale.is_metric, self._seed)
-        graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
-        if self._positioning is not None and self._positioning.agreement is not None:
-            by_gps = self._positioning.agreement
-            agreements.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
-        reference = self._sequence.reference
         return Estimate(
-            network=self._trajectory(T_network),
-            odometry=self._trajectory(T_odometry),
-            optimised=self._trajectory(T_world_camera),
+            network=network,
+            odometry=self._trajectory(odometry.T_world_camera),
+            optimised=self._trajectory(solved.T_world_camera),
             lidar=lidar,
-            reference=None if reference is None else self._trajectory(reference),
+            reference=reference,
             drive=drive,
             state=state,
             scale=scale,
-            factors=factors,
-            views=views,
-            loops=loops.without(graph.dropped),
-            graph=graph,
-            location=location,
+            factors=odometry.factors,
+            views=odometry.views(),
+            loops=solved.loops,
+            graph=solved.graph,
+            location=solved.location,
             first=self.first,
             stopwatch=self._watch,
-            agreements=(*agreements, *of_images),
-            confidence=agreement.confidence([*(each for each in agreements if not each.is_wrong), *of_images]),
+            agreements=(*by_sources, *of_images),
+            confidence=agreement.confidence([*(each for each in by_sources if not each.is_wrong), *of_images]),
             support=support,
         )
+
+    def _completed(self, maps: Sequence[MapSegment], state: FrontEndState, closure: MapClosure) -> Drive:
+        """The drive with its gaps interpolated and the poses of its maps."""
+        events = [*(() if state.keyframes is None else state.keyframes.events), *closure.joins]
+        return complete_drive(state.drive, self._predictor.sources, maps, closure.poses, events)
+
+    def _closed(
+        self,
+        odometry: Odometry,
+        maps: Sequence[MapSegment],
+        state: FrontEndState,
+        chained: Callable[[Drive], Odometry],
+    ) -> tuple[Odometry, LoopClosures]:
+        """The loops, and the odometry, of closed maps where there are maps with loops."""
+        camera, config, seed = self._sequence.intrinsics, self._config.loops, self._seed
+        if not (maps and config.enabled):
+            views, is_metric = odometry.views(), odometry.scale.is_metric
+            return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
+        closure = close_maps(maps, odometry.drive.map_poses, camera, seed)
+        if closure.loops:
+            odometry = chained(self._completed(maps, state, closure))
+        return odometry, closure.closures(odometry.scale)
 
     def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:
         """LiDAR and depth from elsewhere beside the images; ``SlamError`` where lengths by LiDAR alone are wrong."""
@@ -198,13 +299,9 @@ class SlamPipeline:
         by_depth = None if source == "network" else agreement.of_depth(source, error)
         return compared if by_depth is None else [*compared, by_depth.required()]
 
-    def _measure(
-        self, drive: Drive, T_network: FloatArray, by_lidar: Sequence[RelativePose], agreements: list[Agreement]
-    ) -> tuple[Scale, list[RelativePose], FloatArray]:
-        """Scale and factors of a completed drive, and the odometry ``(N, 4, 4)`` chained from the factors."""
-        config = self._config
-        with self._watch.stage("scale"):
-            scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
+    def _chained(self, drive: Drive, T_network: FloatArray, scale: Scale, by_lidar: Sequence[RelativePose]) -> Odometry:
+        """The factors of a completed drive, and the odometry chained from them, in the unit of the mode."""
+        config, agreements = self._config, []
         factors = make_factors(drive, scale, self._noise, config.pose_network, config.visual_odometry)
         T_odometry = chain_odometry(factors, T_network, scale)
         if self.mode in ("reference", "known", "gps"):
@@ -219,7 +316,7 @@ class SlamPipeline:
         if config.lidar.factors and scale.is_metric:
             factors = with_lidar(factors, by_lidar)
             T_odometry = chain_odometry(factors, T_network, scale)
-        return scale, factors, T_odometry
+        return Odometry(drive, scale, factors, T_odometry, agreements)
 
     def fuse(
         self,
@@ -281,7 +378,7 @@ class SlamPipeline:
         checkpoints: CheckpointWriter | None,
         frames: Iterator[Frame] | None,
         watch: Callable[[Observer], None] | None,
-    ) -> tuple[Drive, MapClosure, FrontEndState]:
+    ) -> tuple[tuple[MapSegment, ...], FrontEndState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
         state = None if checkpoint is None else checkpoint.state
@@ -309,10 +406,7 @@ class SlamPipeline:
                 if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 != total:
                     with self._watch.stage("journal"):
                         checkpoints.keep(observer.state())
-            (drive, closure), state = observer.complete_drive(), observer.state()
-        if isinstance(self._sequence, Continued):
-            warn_of_another_place(drive, first)
-        return drive, closure, state
+            return observer.maps(), observer.state()
 
     def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
@@ -323,14 +417,13 @@ class SlamPipeline:
             return self._positioning.scale(T_odometry)
         return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
 
-    def _optimise(
-        self, scale: Scale, factors: Sequence[RelativePose], T_odometry: FloatArray, loops: LoopClosures
-    ) -> tuple[PoseGraph, FloatArray, Location | MeasurementFailure | None]:
-        """The optimised trajectory without the loops that contradict it, and where it lies on the earth."""
-        graph, unit = PoseGraph(self._config.pose_graph), scale.estimate
-        graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
-        positioning = self._positioning
-        location = None if positioning is None else positioning.locate(T_odometry, unit)
+    def _optimised(
+        self, odometry: Odometry, loops: LoopClosures, location: Location | MeasurementFailure | None
+    ) -> Solution:
+        """The most likely trajectory without the loops that contradict it, and where it lies on the earth."""
+        graph, positioning = PoseGraph(self._config.pose_graph), self._positioning
+        T_odometry = odometry.T_world_camera
+        graph.add_relative(*odometry.factors, *(loop.measured for loop in loops.accepted))
         if positioning is not None and isinstance(location, Location):
             positioning.add_factors(graph, location, T_odometry)
         with self._watch.stage("graph"):
@@ -338,8 +431,8 @@ class SlamPipeline:
             while graph.drop_contradicted_loops():
                 T_optimised = graph.optimise(T_odometry)
         if positioning is not None and isinstance(location, Location):
-            location = positioning.relocated(graph, T_optimised, unit)
-        return graph, T_optimised, location
+            location = positioning.relocated(graph, T_optimised, odometry.scale.estimate)
+        return Solution(graph, T_optimised, loops.without(graph.dropped), location)
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self._sequence.stamps, T_world_camera)

@@ -15,8 +15,8 @@ from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.image_gate import ImageGate, Verdict
+from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometryState
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
@@ -27,7 +27,6 @@ from slam.geometry.se3 import FloatArray, chain
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.pending import PendingFrame, PendingTask, has_moved_on, height_of, last_step, predicted_depth
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.memory import return_freed_memory
@@ -161,18 +160,10 @@ class Observer:
         """As `KeyframeTracking.step`, of a finished frame."""
         return self._keyframes.step(index)
 
-    def complete_drive(self) -> tuple[Drive, MapClosure]:
-        """Everything measured so far with its gaps interpolated, and its maps closed; more frames may follow.
-
-        Raises:
-            SlamError: no snippet of usable frames.
-        """
+    def maps(self) -> tuple[MapSegment, ...]:
+        """The maps of keyframes so far, as `KeyframeTracking.maps`; more frames may follow."""
         self.flush()
-        maps = self._keyframes.maps(self._drive)
-        with self._stopwatch.stage("loops"):
-            closure = close_maps(maps, self._intrinsics, self._config.loops, self._seed)
-        events = [*self._keyframes.events, *closure.joins]
-        return complete_drive(self._drive, self._predictor.sources, maps, closure.poses, events), closure
+        return self._keyframes.maps(self._drive)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""

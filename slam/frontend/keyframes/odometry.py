@@ -26,7 +26,7 @@ from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
-from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.geometry.se3 import FloatArray, apply, compose, invert, make
 
 logger = logging.getLogger(__name__)
 
@@ -164,7 +164,7 @@ class KeyframeOdometry:
         turn = image_turn(*images) if turn is None else turn
         state.T_last_step = make(turn.R_now_before, np.zeros(3))
         if turn.correlation > _SURE_CORRELATION and not state.lost:
-            state.T_camera_world = state.T_last_step @ state.T_camera_world
+            state.T_camera_world = compose(state.T_last_step, state.T_camera_world)
             self._add_keyframe(segment, frame, *_NOTHING)
             segment.frames.append(self._tracked(frame, *_NOTHING))
             return

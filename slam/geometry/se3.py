@@ -105,7 +105,7 @@ def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> Floa
     return make(Rotation.from_rotvec(rotation_vector).as_matrix(), np.asarray(t_a_b, dtype=np.float64))
 
 
-def is_se3(T_a_b: FloatArray, tolerance: float = 1e-6) -> bool:
+def is_se3(T_a_b: FloatArray, tolerance: float = 1e-5) -> bool:
     """Whether every matrix of the stack is a finite rigid transform."""
     if T_a_b.shape[-2:] != (4, 4) or not np.isfinite(T_a_b).all():
         return False

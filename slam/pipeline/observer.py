@@ -11,8 +11,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from erfsfm.common.errors import COUNTED
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Frame, Intrinsics, Predictor
+from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate, Verdict
@@ -23,7 +24,7 @@ from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.geometry.se3 import FloatArray, chain
+from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.pipeline.keyframe_tracking import KeyframeTracking
@@ -34,6 +35,7 @@ from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch
 
 logger = logging.getLogger(__name__)
+_NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 
 
 class Observer:
@@ -226,7 +228,7 @@ class Observer:
         self._finish_tasks()
         self._keyframes.choose(self._drive)
         if pending.snippet is not None:
-            self._tasks.append(PendingTask("pose network", pending.snippet, self._drive.snippets.append))
+            self._tasks.append(PendingTask("pose network", pending.snippet, self._keep_snippet))
         if rotation is not None:
             self._tasks.append(PendingTask("geometry", self._beside.submit(rotation), self._keep_rotation))
         if self._config.road.enabled and step is not None:
@@ -290,6 +292,8 @@ class Observer:
         depth, height = self._known(previous)
         current = pending.frame
         measured = self._odometry.measure(previous.frame, current, depth, height, pending.standing)
+        if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
+            measured = MeasurementFailure(_NO_POSE)
         if isinstance(measured, MeasurementFailure):
             self._drive.failures.append((previous.frame.index, current.index, measured.reason))
             logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.index, measured.reason)
@@ -308,6 +312,12 @@ class Observer:
             return None
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
         return self._odometry.relative_rotation(first.frame, current, self._known(first)[0], T_first_current)
+
+    def _keep_snippet(self, snippet: SnippetPoses) -> None:
+        if is_se3(snippet.T_source_target):
+            self._drive.snippets.append(snippet)
+        else:
+            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE, extra=COUNTED)
 
     def _keep_rotation(self, rotation: Any) -> None:
         if rotation is not None:

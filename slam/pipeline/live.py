@@ -284,11 +284,7 @@ class Slam:
 
     @in_turn
     def marginals(self, frame: int) -> FloatArray:
-        """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`.
-
-        Raises:
-            SlamError: the graph has no solution.
-        """
+        """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`, or without one."""
         graph = self._solved().graph
         if isinstance(graph, Missing):
             raise SlamError(graph.reason)

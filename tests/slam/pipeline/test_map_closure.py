@@ -153,8 +153,10 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
             if k not in sparse:
                 tracking.learn(frame, depth)
         resumed = KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, resumed.state())
-    assert [each.frame for each in going_on.events if each.event == "relocalised"] == relocalised
-    assert going_on.events == resumed.events
+    states = going_on.state(), resumed.state()
+    assert states[0] is not None and states[1] is not None
+    assert [each.frame for each in states[0].events if each.event == "relocalised"] == relocalised
+    assert states[0].events == states[1].events
 
 
 def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:

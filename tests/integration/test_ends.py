@@ -11,6 +11,8 @@ import pytest
 
 from erfsfm.common.errors import SHOW_TRACEBACK
 from slam import run_slam
+from slam.commands.live.request import LiveRequest
+from slam.commands.live.run import run_live
 from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import is_se3
 from slam.results.folder import RunFolder
@@ -19,7 +21,7 @@ from slam.simulation.worlds import simulated_world
 
 SIZES = ((160, 120), (320, 240), (416, 128), (640, 480), (1280, 720), (1920, 1080))
 WAYS = ("walk", "look", "phone", "drone", "robot", "robot", "straight", "loop", "stands", "turns")
-DISTURBANCES = ("none", "none", "none", "black", "frozen", "elsewhere", "noise", "dark")
+DISTURBANCES = ("none", "none", "none", "black", "frozen", "elsewhere", "again", "noise", "dark")
 MOST_RENDERED = 320  # columns: larger images are enlarged
 
 
@@ -46,8 +48,7 @@ class Recording:
         frames, disturbance = int(rng.integers(8, most_frames + 1)), str(rng.choice(DISTURBANCES))
         height_m = float(rng.uniform(0.3, 2.0)) if rng.random() < 0.4 else None
         overrides = [f"mapping.enabled={str(rng.random() < 0.3).lower()}", "output.report=false"]
-        if rng.random() < 0.3:
-            overrides.append(f"keyframes.use={rng.choice(['always', 'never'])}")
+        overrides.append(f"keyframes.use={rng.choice(['always', 'auto', 'never'], p=(0.5, 0.4, 0.1))}")
         return cls(seed, way, size, round(fov_deg, 1), round(fps, 2), frames, disturbance, height_m, tuple(overrides))
 
     def write(self, folder: Path) -> None:
@@ -62,7 +63,7 @@ class Recording:
             cv2.imwrite(str(folder / f"{k:06d}.png"), cv2.resize(image, self.size, interpolation=cv2.INTER_LINEAR))
 
     def disturbed(self) -> list[np.ndarray]:
-        """The images, some of them after the first five black, repeated, of another place, noisy or dark."""
+        """The images, some after the first five black, frozen, of another place or one seen before, noisy or dark."""
         rng, images = np.random.default_rng([self.seed, 78]), self.images()
         first = int(rng.integers(5, self.frames))
         last = min(first + int(rng.integers(1, 25)), self.frames)
@@ -73,6 +74,8 @@ class Recording:
                 images[k] = images[first - 1]
             elif self.disturbance == "elsewhere":
                 images[k] = np.ascontiguousarray(images[self.frames - 1 - k][:, ::-1])
+            elif self.disturbance == "again":
+                images[k] = images[(5 * k) % first]
             elif self.disturbance == "noise":
                 images[k] = rng.integers(0, 256, images[k].shape, np.uint8)
             elif self.disturbance == "dark":
@@ -130,3 +133,13 @@ def test_a_run_ends(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     recording = Recording.of(seed)
     recording.write(tmp_path / "images")
     check(recording, run_slam(tmp_path / "images", output=tmp_path / "run", overrides=recording.overrides))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(24, 28))
+def test_a_stream_ends(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SHOW_TRACEBACK, "1")
+    recording = Recording.of(seed)
+    recording.write(tmp_path / "images")
+    options = {"every_frame": True, "wait": 1.0, "overrides": list(recording.overrides)}
+    check(recording, run_live(LiveRequest(dataset=str(tmp_path / "images"), output=tmp_path / "run", **options), print))

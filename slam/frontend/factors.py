@@ -83,12 +83,9 @@ def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePo
 
 
 def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:
-    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent.
-
-    A turn between frames without a map has no length; its sigmas take the unit of the first map.
-    """
+    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
     units = {number: maps.learned_units[number] * unit for number, unit in depth_units(maps, scale).items()}
-    return [pose.scaled(units[maps.segments.get(pose.from_index, 0)]) for pose in poses]
+    return [pose.scaled(units[maps.segments[pose.from_index]]) for pose in poses]
 
 
 def depth_units(maps: KeyframePoses, scale: Scale) -> dict[int, float]:

@@ -99,11 +99,6 @@ class KeyframeOdometry:
         """The maps so far, which grow with the frames."""
         return self._state.segments
 
-    @property
-    def events(self) -> Sequence[TrackingEvent]:
-        """The events of the maps so far."""
-        return self._state.events
-
     def lost_map(self) -> MapSegment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""
         started = [segment for segment in self._state.segments if segment.started]

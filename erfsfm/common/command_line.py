@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import faulthandler
 import logging
 import os
 import re
 import sys
-import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -18,21 +16,14 @@ from typing import NoReturn, TextIO
 
 import typer
 
-from erfsfm.common.errors import OUT_OF_MEMORY, OneLineError, one_line
+from erfsfm.common.errors import explained, shows_traceback
 from erfsfm.common.signals import Terminated
 
-SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 # what they would say of a file is said in our own line
 _OPENCV = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
 _MAY_BE_EMPTY = ("--hazards", "--hazards=")
-# what libraries in C++ say when memory ran out, whatever they raise
-_MEMORY = re.compile(
-    r"(not enough|insufficient|cannot allocate|shared) memory|bad_?alloc|could not create a primitive"
-    r"|failed to map segment|can't start new thread|pthread_create|DataLoader worker .* (exited|killed)",
-    re.IGNORECASE,
-)
 
 
 class Terminal(logging.StreamHandler[TextIO]):
@@ -91,15 +82,15 @@ def run(app: Callable[..., object], name: str, level: int) -> None:
             _say(f"{name}: {why}; what was written stays")
         raise
     except Exception as error:  # the last place where an error can become one line
-        if _shows_all():
+        if shows_traceback():
             raise
-        _end(f"{name}: {_explained(error)}", 1)
+        _end(f"{name}: {explained(error)}", 1)
 
 
 def _quieten_libraries() -> None:
     """Only Python writes to standard error: what libraries in C say of a file is said in our own line."""
     stderr = sys.__stderr__
-    if _shows_all() or stderr is None or sys.stderr is not stderr:
+    if shows_traceback() or stderr is None or sys.stderr is not stderr:
         return
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
@@ -108,10 +99,6 @@ def _quieten_libraries() -> None:
         os.dup2(nowhere.fileno(), 2)
     sys.stderr = spoken
     faulthandler.enable(spoken)  # what a library says before it crashes is not seen either
-
-
-def _shows_all() -> bool:
-    return os.environ.get(SHOW_TRACEBACK, "0") not in ("", "0")
 
 
 def _checked(words: Sequence[str], name: str) -> list[str]:
@@ -128,20 +115,6 @@ def _checked(words: Sequence[str], name: str) -> list[str]:
             _end(f"{name}: {where} is empty: give a value or leave it out (is a shell variable not set?)", 2)
         checked.append(start + (str(Path(value).expanduser()) if value == "~" or value.startswith("~/") else value))
     return checked
-
-
-def _explained(error: Exception) -> str:
-    if isinstance(error, MemoryError) or _MEMORY.search(str(error)):
-        return OUT_OF_MEMORY
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return one_line(f"{error.filename}: {error.strerror}: check the path")
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.strerror:
-        return f"{error.strerror}: standard output, or the folder for temporary files; what was written stays"
-    if isinstance(error, OneLineError | OSError):
-        return one_line(str(error))
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    what = one_line(f"{type(error).__name__}: {error}")
-    return f"unexpected {what} ({Path(place.filename).name}:{place.lineno}); set {SHOW_TRACEBACK}=1 and report this"
 
 
 def _end(line: str, code: int) -> NoReturn:

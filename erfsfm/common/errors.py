@@ -1,13 +1,25 @@
 """The errors a user can cause; the command line prints them as one line and exits with 1."""
 
+import errno
+import os
+import re
+import traceback
+from pathlib import Path
+
 COUNTED = {"counted": True}  # ``extra`` of a warning whose number tells more than each of them
 _LONGEST = 700
 _LAST = 200
 _OF_WORKER = "Original Traceback (most recent call last)"
-
+SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 
 OUT_OF_MEMORY = (
     "memory ran out; what was written stays: use fewer frames or smaller images, or a machine with more memory"
+)
+# what libraries in C++ say when memory ran out, whatever they raise
+_MEMORY = re.compile(
+    r"(not enough|insufficient|cannot allocate|shared) memory|bad_?alloc|could not create a primitive"
+    r"|failed to map segment|can't start new thread|pthread_create|DataLoader worker .* (exited|killed)",
+    re.IGNORECASE,
 )
 
 
@@ -27,6 +39,26 @@ class OneLineError(Exception):
 
     def __str__(self) -> str:
         return one_line(super().__str__())
+
+
+def explained(error: Exception) -> str:
+    """Any error in one line; one that was not foreseen with its place."""
+    if isinstance(error, MemoryError) or _MEMORY.search(str(error)):
+        return OUT_OF_MEMORY
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return one_line(f"{error.filename}: {error.strerror}: check the path")
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.strerror:
+        return f"{error.strerror}: standard output, or the folder for temporary files; what was written stays"
+    if isinstance(error, OneLineError | OSError):
+        return one_line(str(error))
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    what = one_line(f"{type(error).__name__}: {error}")
+    return f"unexpected {what} ({Path(place.filename).name}:{place.lineno}); set {SHOW_TRACEBACK}=1 and report this"
+
+
+def shows_traceback() -> bool:
+    """Whether the user wants an error as Python shows it."""
+    return os.environ.get(SHOW_TRACEBACK, "0") not in ("", "0")
 
 
 class ErfsfmError(OneLineError):

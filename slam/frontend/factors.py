@@ -24,7 +24,7 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.geometry.se3 import FloatArray, rigid
+from slam.geometry.se3 import FloatArray, compose, rigid
 
 logger = logging.getLogger(__name__)
 
@@ -72,12 +72,9 @@ def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePo
 
 
 def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:
-    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent.
-
-    A turn between frames without a map has no length; its sigmas take the unit of the first map.
-    """
+    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
     units = {number: maps.learned_units[number] * unit for number, unit in depth_units(maps, scale).items()}
-    return [pose.scaled(units[maps.segments.get(pose.from_index, 0)]) for pose in poses]
+    return [pose.scaled(units[maps.segments[pose.from_index]]) for pose in poses]
 
 
 def depth_units(maps: KeyframePoses, scale: Scale) -> dict[int, float]:
@@ -102,7 +99,7 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
     T_world_camera = np.tile(np.eye(4), (count, 1, 1))
     T_from_to = rigid(np.array([arriving[k].T_from_to for k in range(1, count)]).reshape(-1, 4, 4))
     for k, T_first_camera in enumerate(T_from_to, start=1):
-        np.matmul(T_world_camera[arriving[k].from_index], T_first_camera, out=T_world_camera[k])
+        T_world_camera[k] = compose(T_world_camera[arriving[k].from_index], T_first_camera)
     return T_world_camera
 
 

@@ -56,11 +56,23 @@ def rotation_angle(R: FloatArray) -> FloatArray:
     return angle
 
 
+def compose(T_a_b: FloatArray, T_b_c: FloatArray) -> FloatArray:
+    """``T_a_c`` ``(..., 4, 4)`` of two transforms, or ``R_a_c`` ``(..., 3, 3)`` of two rotations.
+
+    Where a result is the start of the next, rounding adds up: a step that is predicted from the last two poses, and so
+    on, more than doubles it. One step of Newton's towards the nearest rotation keeps it at that of one product.
+    """
+    T_a_c = T_a_b @ T_b_c
+    R = T_a_c[..., :3, :3]
+    T_a_c[..., :3, :3] = 1.5 * R - 0.5 * R @ np.swapaxes(R, -1, -2) @ R
+    return T_a_c
+
+
 def chain(T_previous_next: FloatArray) -> FloatArray:
     """Poses ``(N + 1, 4, 4)`` in the first frame from N increments ``T_previous_next`` ``(N, 4, 4)``."""
     T_first_k = np.tile(np.eye(4), (len(T_previous_next) + 1, 1, 1))
     for k, increment in enumerate(rigid(T_previous_next)):
-        np.matmul(T_first_k[k], increment, out=T_first_k[k + 1])
+        T_first_k[k + 1] = compose(T_first_k[k], increment)
     return T_first_k
 
 
@@ -108,7 +120,7 @@ def tangent(T_a_b: FloatArray) -> FloatArray:
     return np.concatenate([turned, T_a_b[..., :3, 3]], axis=-1)
 
 
-def is_se3(T_a_b: FloatArray, tolerance: float = 1e-6) -> bool:
+def is_se3(T_a_b: FloatArray, tolerance: float = 1e-5) -> bool:
     """Whether every matrix of the stack is a finite rigid transform."""
     if T_a_b.shape[-2:] != (4, 4) or not np.isfinite(T_a_b).all():
         return False

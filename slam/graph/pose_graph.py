@@ -91,7 +91,7 @@ class PoseGraph:
             SlamError: if frames are not connected or the system cannot be solved.
         """
         _check_connected(self._relative_poses, len(T_world_camera_initial))
-        if not is_se3(T_world_camera_initial, tolerance=1e-5):
+        if not is_se3(T_world_camera_initial):
             raise SlamError("the initial trajectory of the pose graph must be finite rigid transforms")
         for _ in range(_MAX_DROPPED_LOOPS + 1):
             try:
@@ -248,7 +248,7 @@ def _check(edge: RelativePose) -> None:
     name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
     if edge.from_index == edge.to_index or min(edge.from_index, edge.to_index) < 0:
         raise SlamError(f"{name} must link two different frames")
-    if not is_se3(edge.T_from_to, tolerance=1e-5):
+    if not is_se3(edge.T_from_to):
         raise SlamError(f"{name} is not a finite rigid transform")
     for sigmas in (edge.sigmas, edge.graph_sigmas):
         if sigmas.shape != (6,) or not (np.isfinite(sigmas).all() and (sigmas > 0).all()):

@@ -20,16 +20,18 @@ from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.gap_interpolation import complete_drive
+from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, lidar_path, usable_steps
 from slam.frontend.network_factors import chain_raw
-from slam.frontend.scale.metric_scale import Scale, find_scale, height_by_lidar
+from slam.frontend.scale.metric_scale import find_scale, height_by_lidar
 from slam.frontend.scale.scale_estimate import (
     ScaleEstimate,
     resolve_mode,
     scale_from_distance,
     scale_from_reference,
 )
-from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
@@ -38,31 +40,24 @@ from slam.mapping.depth_refinement import decision
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
-from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_doubts
+from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_doubts, warn_of_missing_keyframes
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
+from slam.pipeline.fusion import fuse
 from slam.pipeline.input_checks import require_possible
-from slam.pipeline.keyframe_depth import ROOM_SIGMA, KeyframeDepths
-from slam.pipeline.map_closure import MapClosure
+from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observer
+from slam.pipeline.odometry import Keep, Odometry, Solution, keep_nothing
+from slam.pipeline.pending import read_frame
 from slam.pipeline.positioning import Location, Positioning
-from slam.runtime.errors import SequenceError
+from slam.runtime.attempt import attempt
 from slam.runtime.imports import import_open3d_beside
-from slam.runtime.threads import CORES, read_ahead
+from slam.runtime.storage.record import Missing
+from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.sequences.continued import Continued
 
 logger = logging.getLogger(__name__)
-
-
-def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
-    """A frame, or why its image cannot be read."""
-    try:
-        frame = sequence.frame(index)
-        frame.image.setflags(write=False)
-        return frame
-    except SequenceError as error:
-        return error
 
 
 class SlamPipeline:
@@ -102,8 +97,7 @@ class SlamPipeline:
         """Run the whole system.
 
         Raises:
-            SlamError: the sequence is too short, unreadable or lacks what the scale mode needs, or the graph has no
-                solution.
+            SlamError: the sequence is too short, unreadable or lacks what the scale mode needs.
         """
         estimate = self.estimate()
         return replace(estimate, map=self.fuse(estimate))
@@ -113,6 +107,7 @@ class SlamPipeline:
         checkpoints: CheckpointWriter | None = None,
         frames: Iterator[Frame] | None = None,
         watch: Callable[[Observer], None] | None = None,
+        keep: Keep = keep_nothing,
     ) -> Estimate:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
 
@@ -120,66 +115,100 @@ class SlamPipeline:
             checkpoints: keeps the state of the pass, given to it every 100 frames.
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
+            keep: as in `solve`.
         """
         self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        drive, closure, state = self._observe(checkpoints, frames, watch)
+        maps, state = self._observe(checkpoints, frames, watch)
         self._progress("loops and graph", 0, 1)
-        warn_of_doubts(drive, state.gate)
-        estimate = self.solve(drive, closure, state)
+        estimate = self.solve(maps, state, keep)
+        warn_of_doubts(estimate.drive, state.gate)
+        if isinstance(self._sequence, Continued):
+            warn_of_another_place(estimate.drive, self.first)
         self._progress("loops and graph", 1, 1)
         return estimate
 
-    def solve(self, drive: Drive, closure: MapClosure, state: FrontEndState) -> Estimate:
-        """Lengths, factors and loops of a completed drive and its closed maps, and the trajectory that fits them.
+    def solve(self, maps: Sequence[MapSegment], state: FrontEndState, keep: Keep = keep_nothing) -> Estimate:
+        """Lengths, factors and loops of a drive, and the trajectory that fits them.
+
+        An error in the search for loops costs the loops, one in the graph the loops and the graph: the optimised
+        trajectory then is the odometry.
+
+        Args:
+            maps: of keyframes; none of a drive that is measured by steps alone.
+            state: after the last frame.
+            keep: given each trajectory by its name as soon as it is known: all but the last before loops are sought.
 
         Raises:
-            SlamError: the graph has no solution.
+            SlamError: no snippet of usable frames, or a source of lengths that contradicts the images.
         """
+        if (reference := self._reference) is not None:
+            keep("reference", reference)
+        with self._watch.stage("geometry"):
+            poses = keyframe_poses(maps, self._sequence.intrinsics, self._seed)
+        drive = self._completed(maps, state, MapClosure(poses))
         T_network = chain_raw(drive.snippets, len(drive))
-        with self._watch.stage("lidar"):
-            lidar = lidar_path(self._sequence, self._progress)
-        steps = usable_steps(lidar, are_needed=self.mode == "lidar")
-        agreements = self._compared(drive, steps, state)
-        if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
-            steps = []
-        scale, factors, T_odometry = self._measure(drive, steps, agreements)
+        keep("network", self._trajectory(T_network))
+        odometry = self._measured(drive, T_network, state)
+        keep("odometry", self._trajectory(odometry.T_world_camera))
+        with self._watch.stage("loops"):
+            found = attempt("loop closure", lambda: self._closed(odometry, maps, state))
+        odometry, loops = (odometry, LoopClosures(not_sought=found.reason)) if isinstance(found, Missing) else found
+        at = odometry.T_world_camera, odometry.scale.estimate
+        location = None if self._positioning is None else self._positioning.locate(*at)
+        solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
+        if isinstance(solved, Missing):
+            solved = Solution(solved, odometry.T_world_camera, LoopClosures(not_sought=solved.reason), location)
+        return self._estimate(state, odometry, solved)
+
+    def _estimate(self, state: FrontEndState, odometry: Odometry, solved: Solution) -> Estimate:
+        """All of it, with what follows for its confidence."""
+        drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
+        if self._positioning is not None and self._positioning.agreement is not None:
+            by_gps = self._positioning.agreement
+            by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
         support = agreement.frame_support(range(len(drive)), drive.motions, drive.map_poses.segments)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
-        views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
-        if drive.maps and self._config.loops.enabled:
-            loops = closure.closures(scale)
-        else:
-            with self._watch.stage("loops"):
-                camera, config = self._sequence.intrinsics, self._config.loops
-                loops = close_loops(views, T_odometry, camera, config, scale.is_metric, self._seed)
-        graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
-        if self._positioning is not None and self._positioning.agreement is not None:
-            by_gps = self._positioning.agreement
-            agreements.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
-        reference = self._sequence.reference
         return Estimate(
-            network=self._trajectory(T_network),
-            odometry=self._trajectory(T_odometry),
-            optimised=self._trajectory(T_world_camera),
-            lidar=lidar,
-            reference=None if reference is None else self._trajectory(reference),
+            network=self._trajectory(odometry.T_network),
+            odometry=self._trajectory(odometry.T_world_camera),
+            optimised=self._trajectory(solved.T_world_camera),
+            lidar=odometry.lidar,
+            reference=self._reference,
             drive=drive,
             state=state,
             scale=scale,
-            factors=factors,
-            views=views,
-            loops=loops.without(graph.dropped),
-            graph=graph,
-            location=location,
+            factors=odometry.factors,
+            views=odometry.views(),
+            loops=solved.loops,
+            graph=solved.graph,
+            location=solved.location,
             first=self.first,
             stopwatch=self._watch,
-            agreements=(*agreements, *of_images),
-            confidence=agreement.confidence([*(each for each in agreements if not each.is_wrong), *of_images]),
+            agreements=(*by_sources, *of_images),
+            confidence=agreement.confidence([*(each for each in by_sources if not each.is_wrong), *of_images]),
             support=support,
         )
+
+    def _completed(self, maps: Sequence[MapSegment], state: FrontEndState, closure: MapClosure) -> Drive:
+        """The drive with its gaps interpolated and the poses of its maps."""
+        events = [*(() if state.keyframes is None else state.keyframes.events), *closure.joins]
+        return complete_drive(state.drive, self._predictor.sources, maps, closure.poses, events)
+
+    def _closed(
+        self, odometry: Odometry, maps: Sequence[MapSegment], state: FrontEndState
+    ) -> tuple[Odometry, LoopClosures]:
+        """The loops of a drive, and its odometry, which that of closed maps replaces."""
+        camera, config, seed = self._sequence.intrinsics, self._config.loops, self._seed
+        if not (maps and config.enabled):
+            views, is_metric = odometry.views(), odometry.scale.is_metric
+            return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
+        closure = close_maps(maps, odometry.drive.map_poses, camera, seed)
+        if closure.loops:
+            odometry = self._chained(replace(odometry, drive=self._completed(maps, state, closure)))
+        return odometry, closure.closures(odometry.scale)
 
     def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:
         """LiDAR and depth from elsewhere beside the images; ``SlamError`` where lengths by LiDAR alone are wrong."""
@@ -192,28 +221,36 @@ class SlamPipeline:
         by_depth = None if source == "network" else agreement.of_depth(source, error)
         return compared if by_depth is None else [*compared, by_depth.required()]
 
-    def _measure(
-        self, drive: Drive, by_lidar: Sequence[RelativePose], agreements: list[Agreement]
-    ) -> tuple[Scale, list[RelativePose], FloatArray]:
-        """Scale and factors of a completed drive, and the odometry ``(N, 4, 4)`` chained from the factors."""
-        config = self._config
+    def _measured(self, drive: Drive, T_network: FloatArray, state: FrontEndState) -> Odometry:
+        """Lengths, factors and odometry of a completed drive."""
+        with self._watch.stage("lidar"):
+            lidar = lidar_path(self._sequence, self._progress)
+        steps = usable_steps(lidar, are_needed=self.mode == "lidar")
+        agreements = self._compared(drive, steps, state)
+        if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
+            steps = []
         with self._watch.stage("scale"):
-            scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
+            scale = find_scale(self.mode, self._sequence.camera_height_m, drive, steps, self._config.lengths)
+        return self._chained(Odometry(drive, T_network, lidar, steps, scale, [], T_network, tuple(agreements)))
+
+    def _chained(self, odometry: Odometry) -> Odometry:
+        """The same with the factors of its drive, chained, in the unit of the mode: of closed maps it is found anew."""
+        config, drive, scale, agreements = self._config, odometry.drive, odometry.scale, odometry.agreements
         factors = make_factors(drive, scale, config.visual_odometry)
         T_odometry = chain_odometry(factors, len(drive))
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(T_odometry)
-            if isinstance(unit, ScaleEstimate) and isinstance(scale.estimate, ScaleEstimate):
+            if isinstance(unit, ScaleEstimate) and isinstance(scale.estimate, ScaleEstimate) and not scale.is_metric:
                 name, height, spread = f"scale.mode={self.mode}", self._sequence.camera_height_m, scale.estimate.spread
-                agreements.append(agreement.of_height(name, unit.value, height, spread).required())
+                agreements += (agreement.of_height(name, unit.value, height, spread).required(),)
             scale = scale.in_metres(unit)
             if isinstance(unit, ScaleEstimate):
                 factors = [factor.scaled(unit.value) for factor in factors]
                 T_odometry[:, :3, 3] *= unit.value
         if config.lidar.factors and scale.is_metric:
-            factors = with_lidar(factors, by_lidar)
+            factors = with_lidar(factors, odometry.lidar_steps)
             T_odometry = chain_odometry(factors, len(drive))
-        return scale, factors, T_odometry
+        return replace(odometry, scale=scale, factors=factors, T_world_camera=T_odometry, agreements=agreements)
 
     def fuse(
         self,
@@ -221,36 +258,11 @@ class SlamPipeline:
         compare: Callable[[KeyframeDepth], None] | None = None,
         folder: Path | None = None,
     ) -> TsdfMap | None:
-        """Learned depth at the optimised poses, refined and fused into one surface; None where mapping is switched off.
-
-        A camera that is carried turns on the spot, where nothing measures learned depth. The error of that over
-        distance is known by steps, which measure only the first frames there, and is not taken out.
-
-        ``compare`` is called with the depth of each keyframe that is far enough from the one before; ``folder`` is
-        where finished submaps go, a temporary folder where it is None.
-        """
-        keyframes = estimate.drive.keyframes
-        if not self._config.mapping.enabled or not keyframes:
+        """The map, as `fusion.fuse`; None where mapping is switched off, or no keyframe was kept."""
+        if not self._config.mapping.enabled or not estimate.drive.keyframes:
             return None
-        height, width = keyframes[0].depth_unscaled.shape
-        intrinsics = self._sequence.intrinsics.resized(width, height)
-        T_world_camera = estimate.optimised.T_world_camera
-        config = self._config
-        scales, is_carried = estimate.scale.per_frame, bool(estimate.drive.maps)
-        error = DepthError() if is_carried else estimate.state.odometry.depth_error
-        guess_sigma = ROOM_SIGMA if is_carried and config.depth.is_learned else None
-        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, self._decide, guess_sigma)
-        mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
-        tsdf_map = TsdfMap(mapping, intrinsics, folder)
-        selected = tsdf_map.select([keyframe.index for keyframe in keyframes], T_world_camera)
-        with closing(read_ahead(depths.at, selected, CORES)) as ahead:
-            for done, keyframe in enumerate(self._watch.each("depth refinement", ahead), 1):
-                if compare is not None:
-                    compare(keyframe)
-                with self._watch.stage("map"):
-                    tsdf_map.integrate(keyframe)
-                self._progress("map", done, len(selected))
-        return tsdf_map
+        camera, progress = self._sequence.intrinsics, self._progress
+        return fuse(estimate, camera, self._config, self._decide, compare, folder, progress)
 
     def require_possible(self) -> None:
         """Check that this run can succeed; raises as `input_checks.require_possible` and `Positioning`."""
@@ -275,23 +287,14 @@ class SlamPipeline:
         checkpoints: CheckpointWriter | None,
         frames: Iterator[Frame] | None,
         watch: Callable[[Observer], None] | None,
-    ) -> tuple[Drive, MapClosure, FrontEndState]:
+    ) -> tuple[tuple[MapSegment, ...], FrontEndState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
         state = None if checkpoint is None else checkpoint.state
-        if state is not None and self._config.mapping.enabled and not state.drive.keyframes:
-            logger.warning(
-                "the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first
-            )
-        observer = Observer(
-            self._predictor,
-            self._sequence.intrinsics,
-            self._config,
-            self._watch,
-            self._seed,
-            state,
-            self._sequence.camera_height_m,
-        )
+        if state is not None and self._config.mapping.enabled:
+            warn_of_missing_keyframes(state.drive, first)
+        parts = self._config, self._watch, self._seed, state, self._sequence.camera_height_m
+        observer = Observer(self._predictor, self._sequence.intrinsics, *parts)
         ahead = read_ahead(partial(read_frame, self._sequence), range(first, total))
         with observer, closing(ahead) as read:
             for index, frame in enumerate(self._watch.each("read", frames or read), first):
@@ -303,10 +306,7 @@ class SlamPipeline:
                 if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 != total:
                     with self._watch.stage("journal"):
                         checkpoints.keep(observer.state())
-            (drive, closure), state = observer.complete_drive(), observer.state()
-        if isinstance(self._sequence, Continued):
-            warn_of_another_place(drive, first)
-        return drive, closure, state
+            return observer.maps(), observer.state()
 
     def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
@@ -317,14 +317,13 @@ class SlamPipeline:
             return self._positioning.scale(T_odometry)
         return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
 
-    def _optimise(
-        self, scale: Scale, factors: Sequence[RelativePose], T_odometry: FloatArray, loops: LoopClosures
-    ) -> tuple[PoseGraph, FloatArray, Location | MeasurementFailure | None]:
-        """The optimised trajectory without the loops that contradict it, and where it lies on the earth."""
-        graph, unit = PoseGraph(self._config.pose_graph), scale.estimate
-        graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
-        positioning = self._positioning
-        location = None if positioning is None else positioning.locate(T_odometry, unit)
+    def _optimised(
+        self, odometry: Odometry, loops: LoopClosures, location: Location | MeasurementFailure | None
+    ) -> Solution:
+        """The most likely trajectory without the loops that contradict it, and where it lies on the earth."""
+        graph, positioning = PoseGraph(self._config.pose_graph), self._positioning
+        T_odometry = odometry.T_world_camera
+        graph.add_relative(*odometry.factors, *(loop.measured for loop in loops.accepted))
         if positioning is not None and isinstance(location, Location):
             positioning.add_factors(graph, location, T_odometry)
         with self._watch.stage("graph"):
@@ -332,8 +331,13 @@ class SlamPipeline:
             while graph.drop_contradicted_loops():
                 T_optimised = graph.optimise(T_odometry)
         if positioning is not None and isinstance(location, Location):
-            location = positioning.relocated(graph, T_optimised, unit)
-        return graph, T_optimised, location
+            location = positioning.relocated(graph, T_optimised, odometry.scale.estimate)
+        return Solution(graph, T_optimised, loops.without(graph.dropped), location)
+
+    @property
+    def _reference(self) -> Trajectory | None:
+        reference = self._sequence.reference
+        return None if reference is None else self._trajectory(reference)
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self._sequence.stamps, T_world_camera)

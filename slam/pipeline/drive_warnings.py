@@ -68,3 +68,9 @@ def warn_of_another_place(drive: Drive, first: int) -> None:
                 start,
                 reason,
             )
+
+
+def warn_of_missing_keyframes(drive: Drive, first: int) -> None:
+    """Warn where the run that goes on at frame ``first`` has no images of those before."""
+    if not drive.keyframes:
+        logger.warning("the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first)

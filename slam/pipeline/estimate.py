@@ -20,6 +20,7 @@ from slam.loops.places import Places
 from slam.mapping.map import TsdfMap
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.positioning import Location
+from slam.runtime.storage.record import Missing
 from slam.runtime.timing import Stopwatch
 
 
@@ -29,6 +30,7 @@ class Estimate:
 
     ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
     ``state`` is that of the front end, for a run that continues this one; frames before ``first`` are of earlier runs.
+    ``graph`` is the reason where it has no solution: the optimised trajectory then is the odometry.
     ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
     each optional source contradicts the images, ``confidence`` what follows from
     all of them; ``support`` ``(N,)`` is that of the motion to each frame.
@@ -45,7 +47,7 @@ class Estimate:
     factors: list[RelativePose]
     views: list[View]
     loops: LoopClosures
-    graph: PoseGraph
+    graph: PoseGraph | Missing
     location: Location | MeasurementFailure | None
     first: int
     stopwatch: Stopwatch

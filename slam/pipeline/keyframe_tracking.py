@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from itertools import islice
 from typing import Literal
@@ -11,7 +11,7 @@ import numpy as np
 
 from erfsfm.common.threads import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
-from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
+from slam.frames import DepthMap, Frame, Intrinsics, View
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import new_corners
@@ -164,11 +164,6 @@ class KeyframeTracking:
             return ()
         maps = [each.copy() for each in self._odometry.segments if each.started]
         return tuple(part for each in maps for part in parts_of(each, self._intrinsics))
-
-    @property
-    def events(self) -> Sequence[TrackingEvent]:
-        """What became of the maps so far."""
-        return () if self._odometry is None else self._odometry.events
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:

@@ -31,6 +31,7 @@ from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH
 from slam.runtime.storage.files import write_atomically
+from slam.runtime.storage.record import Missing
 from slam.runtime.threads import Turns, in_turn
 from slam.runtime.timing import Stopwatch
 from slam.sequences.growing import GrowingSequence
@@ -240,12 +241,12 @@ class Slam:
         """Solve the whole drive so far with its loops, as ``run`` does; later frames go on from its poses.
 
         Raises:
-            SlamError: the graph has no solution.
+            SlamError: as `SlamPipeline.solve`.
         """
         self._observer.flush()
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        estimate = self._pipeline.solve(*self._observer.complete_drive(), self._observer.state())
+        estimate = self._pipeline.solve(self._observer.maps(), self._observer.state())
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         self._estimate = estimate
         return estimate.loops
@@ -255,7 +256,7 @@ class Slam:
         """The frames whose corners `points` gives; the whole drive so far is solved first, as by `close_loops`.
 
         Raises:
-            SlamError: there are too few usable frames, or the graph has no solution.
+            SlamError: there are too few usable frames; as `SlamPipeline.solve`.
         """
         estimate = self._solved()
         return estimate.optimised.select(np.array([view.index for view in estimate.views], np.intp))
@@ -279,8 +280,11 @@ class Slam:
 
     @in_turn
     def marginals(self, frame: int) -> FloatArray:
-        """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`."""
-        return self._solved().graph.marginal(frame)
+        """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`, or without one."""
+        graph = self._solved().graph
+        if isinstance(graph, Missing):
+            raise SlamError(graph.reason)
+        return graph.marginal(frame)
 
     @in_turn
     def surface(self) -> Any:

@@ -13,7 +13,7 @@ from slam.frontend.factors import chain_odometry, scaled_steps
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import resolve_mode
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, compose, invert
 from slam.pipeline.observer import Observer
 
 _LAST_STEPS = 4  # looked through for that to a frame
@@ -127,7 +127,7 @@ class LivePoses:
             T_before_frame = motion.relative_pose.T_from_to.copy()
         if T_before_frame is not self._T_previous_newest:
             T_before_frame[:3, 3] *= self.unit
-        self._T_world_camera.append(self._T_world_camera[before] @ T_before_frame)
+        self._T_world_camera.append(compose(self._T_world_camera[before], T_before_frame))
         self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
         return by_keyframes is not None
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
-from slam.frontend.factors import depth_units, scaled_poses
+from slam.frontend.factors import scaled_poses
 from slam.frontend.keyframes.joining import SharedCorners, join
 from slam.frontend.keyframes.local_map import TrackedKeyframe
 from slam.frontend.keyframes.map_segment import MapSegment
@@ -23,7 +22,7 @@ from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, apply, invert, make
 from slam.graph.similarity_graph import optimise_similarities
 from slam.loops.closure import LoopClosures
-from slam.loops.maps import MapLoop, MapLoops, find_map_loops
+from slam.loops.maps import MapLoop, find_map_loops
 from slam.loops.verification import Loop, RejectedLoop
 
 logger = logging.getLogger(__name__)
@@ -56,41 +55,36 @@ class MapClosure:
 
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
-        scaled, depth_unit = scaled_poses(self.poses.loops, self.poses, scale), depth_units(self.poses, scale)
+        scaled = scaled_poses(self.poses.loops, self.poses, scale)
         accepted = (Loop(pose, loop.inliers, loop.score) for pose, loop in zip(scaled, self.loops, strict=True))
         rejected = [
-            loop.scaled(self.learned_units[loop.from_index] * depth_unit[self.poses.segments[loop.from_index]])
+            loop.scaled(self.learned_units[loop.from_index] * float(scale.per_frame[loop.from_index]))
             for loop in self.rejected
         ]
         rejected.sort(key=lambda r: (-r.inliers, -r.score, r.to_index, r.from_index))
         return LoopClosures(self.candidates, self.measured, tuple(accepted), tuple(rejected))
 
 
-def close_maps(maps: Sequence[MapSegment], intrinsics: Intrinsics, config: LoopsConfig, seed: int = 0) -> MapClosure:
+def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
     """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
 
     Args:
-        maps: of one drive, in time order; they stay as they are.
+        maps: of one drive, in time order, started; they stay as they are.
+        poses: by these maps, which remain where no loop is found.
         intrinsics: of all images.
-        config: whether loops are sought.
         seed: of RANSAC.
     """
-    maps = [segment for segment in maps if segment.started]
     rows = _Rows(maps)
-    if not maps:
-        return MapClosure(KeyframePoses())
-    found = MapLoops()
-    if config.enabled:
-        found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, seed)
+    found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, seed)
     loops, rejected = list(found.found), list(found.rejected)
-    while True:
+    while loops:
         closed, wrong = _closed(rows, loops, intrinsics)
         if not wrong:
+            ends = [(rows.keyframes[loop.rows[0]].index, rows.keyframes[loop.rows[1]].index) for loop in loops]
+            poses = keyframe_poses(closed, intrinsics, seed, ends)
             break
         loops = [loop for loop in loops if loop not in wrong]
         rejected += [rows.refused(loop, "its corners are not the same points after the adjustment") for loop in wrong]
-    ends = [(rows.keyframes[loop.rows[0]].index, rows.keyframes[loop.rows[1]].index) for loop in loops]
-    poses = keyframe_poses(closed, intrinsics, seed, ends)
     joins = rows.joins(loops)
     for joined in joins:
         logger.info("%s", joined)

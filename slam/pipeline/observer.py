@@ -11,23 +11,23 @@ from typing import Any, Self
 
 import numpy as np
 
+from erfsfm.common.errors import COUNTED
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Frame, Intrinsics, Predictor
+from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.image_gate import ImageGate, Verdict
+from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometryState
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.geometry.se3 import FloatArray, chain
+from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.pending import PendingFrame, PendingTask, has_moved_on, height_of, last_step, predicted_depth
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.memory import return_freed_memory
@@ -35,6 +35,7 @@ from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch
 
 logger = logging.getLogger(__name__)
+_NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 
 
 class Observer:
@@ -161,18 +162,10 @@ class Observer:
         """As `KeyframeTracking.step`, of a finished frame."""
         return self._keyframes.step(index)
 
-    def complete_drive(self) -> tuple[Drive, MapClosure]:
-        """Everything measured so far with its gaps interpolated, and its maps closed; more frames may follow.
-
-        Raises:
-            SlamError: no snippet of usable frames.
-        """
+    def maps(self) -> tuple[MapSegment, ...]:
+        """The maps of keyframes so far, as `KeyframeTracking.maps`; more frames may follow."""
         self.flush()
-        maps = self._keyframes.maps(self._drive)
-        with self._stopwatch.stage("loops"):
-            closure = close_maps(maps, self._intrinsics, self._config.loops, self._seed)
-        events = [*self._keyframes.events, *closure.joins]
-        return complete_drive(self._drive, self._predictor.sources, maps, closure.poses, events), closure
+        return self._keyframes.maps(self._drive)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -235,7 +228,7 @@ class Observer:
         self._finish_tasks()
         self._keyframes.choose(self._drive)
         if pending.snippet is not None:
-            self._tasks.append(PendingTask("pose network", pending.snippet, self._drive.snippets.append))
+            self._tasks.append(PendingTask("pose network", pending.snippet, self._keep_snippet))
         if rotation is not None:
             self._tasks.append(PendingTask("geometry", self._beside.submit(rotation), self._keep_rotation))
         if self._config.road.enabled and step is not None:
@@ -299,6 +292,8 @@ class Observer:
         depth, height = self._known(previous)
         current = pending.frame
         measured = self._odometry.measure(previous.frame, current, depth, height, pending.standing)
+        if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
+            measured = MeasurementFailure(_NO_POSE)
         if isinstance(measured, MeasurementFailure):
             self._drive.failures.append((previous.frame.index, current.index, measured.reason))
             logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.index, measured.reason)
@@ -317,6 +312,12 @@ class Observer:
             return None
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
         return self._odometry.relative_rotation(first.frame, current, self._known(first)[0], T_first_current)
+
+    def _keep_snippet(self, snippet: SnippetPoses) -> None:
+        if is_se3(snippet.T_source_target):
+            self._drive.snippets.append(snippet)
+        else:
+            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE, extra=COUNTED)
 
     def _keep_rotation(self, rotation: Any) -> None:
         if rotation is not None:

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from slam.frames import DepthMap, Frame, Mask, Predictor, SnippetPoses, resized_mask
+from slam.frames import DepthMap, Frame, Mask, Predictor, Sequence, SnippetPoses, resized_mask
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.motion import Motion
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import SequenceError, SlamError
 
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
 _LAST_STEPS = 4
@@ -78,3 +78,13 @@ def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:
     if shape != wanted or kind != np.float32:
         raise SlamError(f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}")
     return depth
+
+
+def read_frame(sequence: Sequence, index: int) -> Frame | SequenceError:
+    """A frame, or why its image cannot be read."""
+    try:
+        frame = sequence.frame(index)
+        frame.image.setflags(write=False)
+        return frame
+    except SequenceError as error:
+        return error

@@ -171,6 +171,8 @@ def _scale(result: Estimate) -> ScaleMetrics:
 
 def _graph(result: Estimate) -> GraphMetrics:
     """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
+    if isinstance(result.graph, Missing):
+        return GraphMetrics.missing(result.graph.reason)
     nodes, factors = len(result.optimised), result.graph.relative_poses
     if result.reference is None:
         return GraphMetrics(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)

@@ -26,6 +26,7 @@ class SimulationOptions:
 
     A ``varied`` street has another camera than KITTI's, railings and people, and cars that overtake if any move;
     ``varied`` rooms have another focal length. ``rate``, frames a second, and ``motion`` are of rooms.
+    ``fov_deg`` is the horizontal field of view of square pixels; None is that of the world's own camera.
     """
 
     route: WorldKind = "loop"
@@ -37,6 +38,7 @@ class SimulationOptions:
     varied: bool = False
     motion: Motion | None = None
     rate: float = STREET_RATE
+    fov_deg: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse invalid options.

@@ -53,8 +53,8 @@ class SimulatedRooms(SimulatedWorld):
         self._carried = carry(floor, options.motion or "walk", seconds, options.rate, options.seed)
         self._walks = [carry(floor, "walk", seconds, options.rate, options.seed + 1000 * k) for k in range(1, motions)]
         self._people = _people(options.seed) if "people" in options.hazards else None
-        fov = _USUAL_FOV_DEG
-        if options.varied:
+        fov = options.fov_deg or _USUAL_FOV_DEG
+        if options.varied and options.fov_deg is None:
             fov = float(np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG))))
         T_scene_camera = self._carried.poses(self._moments(np.arange(options.frames) / options.rate, options))
         super().__init__(options, square_intrinsics(options.width, options.height, fov), T_scene_camera)

@@ -15,7 +15,7 @@ from slam.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.simulation.hazards import Traffic
 from slam.simulation.lidar import T_CAMERA_LIDAR, beam_directions, measured
 from slam.simulation.light import draw_weather, sky
-from slam.simulation.optics import draw_mount, kitti_intrinsics
+from slam.simulation.optics import draw_mount, kitti_intrinsics, square_intrinsics
 from slam.simulation.options import SimulationOptions
 from slam.simulation.painter import Hits, paint
 from slam.simulation.route import RouteKind, plan_route
@@ -41,6 +41,8 @@ class SimulatedStreet(SimulatedWorld):
         mount = draw_mount(options.seed) if options.varied else None
         if mount is not None:
             K[[0, 1], [0, 1]] *= mount.zoom
+        if options.fov_deg is not None:
+            K = square_intrinsics(options.width, options.height, options.fov_deg)
         self._route = plan_route(cast(RouteKind, options.route), options.frames, options.seed, still, mount)
         super().__init__(options, K, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m

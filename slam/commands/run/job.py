@@ -9,9 +9,8 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.errors import explained
 from erfsfm.common.progress import Progress, silent
-from erfsfm.common.signals import Terminated
 from erfsfm.common.threads import limit_library_threads
 from slam.config.sections import SlamConfig, dump_yaml
 from slam.evaluation.double_walls import double_wall_share
@@ -38,6 +37,7 @@ from slam.results.report.pictures import DepthPictures, loop_pictures
 from slam.results.report.rendering import Picture
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
+from slam.runtime.attempt import attempt
 from slam.runtime.errors import EmptyMapError, RunError, SlamError
 from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES, SUBMAPS
 from slam.runtime.storage.record import Missing
@@ -109,7 +109,8 @@ def _run(job: Job, folder: RunFolder) -> None:
     stream, checkpoints = job.stream, _checkpoints(job, folder.path)
     frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
     goes_on = not isinstance(job.recording, Continued)  # not in a folder without the images before its own
-    estimate = job.pipeline.estimate(checkpoints if goes_on else None, frames, watch)
+    kept = checkpoints if goes_on else None
+    estimate = job.pipeline.estimate(kept, frames, watch, folder.write_trajectory)
     _write_estimate(folder, estimate, job)
     if checkpoints is not None:
         checkpoints.finish(estimate.state)
@@ -126,18 +127,26 @@ def _run(job: Job, folder: RunFolder) -> None:
         with estimate.stopwatch.stage("evaluation"):
             quality.add(keyframe)
 
-    result = replace(estimate, map=job.pipeline.fuse(estimate, compare, folder.path))
-    map_metrics = _write_map(folder, result, job)
+    def mapped() -> tuple[Estimate, MapMetrics]:
+        result = replace(estimate, map=job.pipeline.fuse(estimate, compare, folder.path))
+        return result, _write_map(folder, result, job)
+
+    found = attempt("the map", mapped)
+    result, map_metrics = (estimate, MapMetrics.missing(found.reason)) if isinstance(found, Missing) else found
     depth = quality.metrics(job.settings.depth.refine != "none")
     timing = timing_of(result.stopwatch, len(job.recording) - result.first)
     metrics = metrics.changed(timing=timing, depth=depth, map=map_metrics)
     folder.write_metrics(metrics)
     metrics = metrics.changed(status="ok", reason=None)
     output = job.settings.output
+
+    def reported() -> None:
+        views = write_map_views(folder, output.viewer_triangles if output.report else 0)
+        if output.report:
+            write_report(folder, depths.pictures(), _loop_pictures(result, job), views, metrics)
+
     job.progress("report", 0, 1)
-    views = write_map_views(folder, output.viewer_triangles if output.report else 0)
-    if output.report:
-        write_report(folder, depths.pictures(), _loop_pictures(result, job), views, metrics)
+    attempt("the report", reported)
     folder.write_metrics(metrics)
     job.progress("report", 1, 1)
     if job.rerun is not None:
@@ -168,15 +177,14 @@ def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
 
 
 def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
-    """Trajectories, graph, loops and places."""
-    for name in ("network", "odometry", "optimised"):
+    """What the pass over the frames did not write yet: trajectories by loops and graph, these, and places."""
+    for name in ("odometry", "optimised"):
         folder.write_trajectory(name, getattr(result, name))
-    if result.reference is not None:
-        folder.write_trajectory("reference", result.reference)
     lidar = lidar_trajectory(result)
     if lidar is not None:
         folder.write_trajectory("lidar", lidar)
-    result.graph.write_g2o(folder.path / GRAPH)
+    if not isinstance(result.graph, Missing):
+        result.graph.write_g2o(folder.path / GRAPH)
     folder.write_text(LOOPS, json.dumps(result.loops.details(), indent=2, allow_nan=False))
     folder.write(PLACES, result.places(job.recording.intrinsics).write)
 
@@ -213,8 +221,7 @@ def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseExceptio
 
     Errors of writing them are ignored, so the first one is raised.
     """
-    known = isinstance(error, SlamError | ErfsfmError | Terminated)
-    reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
+    reason = explained(error) if isinstance(error, Exception) else str(error) or type(error).__name__
     log.failed(reason)
     with suppress(SlamError, OSError):
         folder.write_metrics(folder.metrics().changed(status="failed", reason=reason))

@@ -18,7 +18,7 @@ from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA, HUBER
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.projection import pixel_jacobian
-from slam.geometry.se3 import FloatArray, apply, make
+from slam.geometry.se3 import FloatArray, apply, compose, make
 
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
@@ -171,7 +171,7 @@ class BundleAdjustment:
     ) -> tuple[FloatArray, FloatArray]:
         T = T_camera_world.copy()
         moved = make(Rotation.from_rotvec(by_camera[:, :3]).as_matrix(), by_camera[:, 3:])
-        T[self._free] = moved @ T[self._free]
+        T[self._free] = compose(moved, T[self._free])
         X = points.copy()
         X[: self._points] += by_point
         return T, X

@@ -12,7 +12,7 @@ from slam.frontend.keyframes.bundle_adjustment import Noise
 from slam.geometry.projection import LEAST_DEPTH, pixel_jacobian
 from slam.geometry.resection import consensus
 from slam.geometry.robust import mad_sigma, median
-from slam.geometry.se3 import FloatArray, apply, make, rotation_matrix
+from slam.geometry.se3 import FloatArray, apply, compose, make, rotation_matrix
 
 MIN_POINTS = 20  # least number of points that give a camera its pose
 INLIER_PX = 3.0  # residual of an inlier of a camera's pose, pixels
@@ -95,7 +95,7 @@ def _refined(
         weighted = (weight * J).reshape(6, -1)
         information = weighted @ J.reshape(6, -1).T + 1e-9 * np.eye(6)
         step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
-        T = make(rotation_matrix(step[:3]), step[3:]) @ T
+        T = compose(make(rotation_matrix(step[:3]), step[3:]), T)
         residual, J, X = _whitened(T, points, spread, rays, focal)
         if np.abs(step).max() < _CONVERGED:
             break

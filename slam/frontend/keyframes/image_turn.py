@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Grey, Intrinsics
-from slam.geometry.se3 import FloatArray, rotation_matrix
+from slam.geometry.se3 import FloatArray, compose, rotation_matrix
 
 _REDUCED = 8  # an image over the small one
 _COARSE = 2  # a small image over the one that all guesses are tried on
@@ -100,7 +100,7 @@ class _Alignment:
             weighted = self._jacobian * (inside / (1.0 + (residual / _OUTLIER) ** 2))
             information = weighted @ self._jacobian.T + 1e-6 * np.eye(3)
             step = np.linalg.solve(information, weighted @ residual)
-            R = R @ rotation_matrix(-step)
+            R = compose(R, rotation_matrix(-step))
             if np.abs(step).max() < _CONVERGED:
                 break
         turned, inside = self._turned(R)

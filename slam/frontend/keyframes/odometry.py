@@ -26,7 +26,7 @@ from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px
-from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.geometry.se3 import FloatArray, apply, compose, invert, make
 
 logger = logging.getLogger(__name__)
 
@@ -99,11 +99,6 @@ class KeyframeOdometry:
         """The maps so far, which grow with the frames."""
         return self._state.segments
 
-    @property
-    def events(self) -> Sequence[TrackingEvent]:
-        """The events of the maps so far."""
-        return self._state.events
-
     def lost_map(self) -> MapSegment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""
         started = [segment for segment in self._state.segments if segment.started]
@@ -164,7 +159,7 @@ class KeyframeOdometry:
         turn = image_turn(*images) if turn is None else turn
         state.T_last_step = make(turn.R_now_before, np.zeros(3))
         if turn.correlation > _SURE_CORRELATION and not state.lost:
-            state.T_camera_world = state.T_last_step @ state.T_camera_world
+            state.T_camera_world = compose(state.T_last_step, state.T_camera_world)
             self._add_keyframe(segment, frame, *_NOTHING)
             segment.frames.append(self._tracked(frame, *_NOTHING))
             return

@@ -169,7 +169,7 @@ def _seen_from(
     if known.sum() < MIN_POINTS:
         return None
     pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, seed)
-    if (pose.residual_px < INLIER_PX).sum() < MIN_POINTS:
+    if (pose.residual_px < INLIER_PX).sum() < MIN_POINTS or not np.isfinite(pose.sigmas).all():
         return None
     return pose.T_camera_world, CORNER_CORRELATION * pose.sigmas
 

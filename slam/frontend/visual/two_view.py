@@ -26,7 +26,7 @@ from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
 from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry.robust import mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray, rotation_matrix
+from slam.geometry.se3 import FloatArray, compose, rotation_matrix
 
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
@@ -172,7 +172,7 @@ class TwoViewEstimator:
             if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < _CONVERGED:
                 break
             direction = unit_pose.direction + tangent @ step[3:5]
-            R_current_previous = rotation_matrix(step[:3]) @ unit_pose.R_current_previous
+            R_current_previous = compose(rotation_matrix(step[:3]), unit_pose.R_current_previous)
             unit_pose = UnitRelativePose(R_current_previous, direction / np.linalg.norm(direction))
             length = max(length + float(step[5]), 0.2 * length)
         lift = np.zeros((6, 5))

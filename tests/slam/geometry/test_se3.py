@@ -33,6 +33,14 @@ def test_invert_undoes_and_keeps_stacks(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(se3.invert(se3.invert(T_a_b)), T_a_b, atol=1e-14)
 
 
+def test_what_is_predicted_from_its_own_predictions_stays_rigid() -> None:
+    step = se3.from_rotation_vector(np.array([0.01, 0.02, -0.03]), np.array([0.1, 0.0, 0.2]))
+    before, now = np.eye(4), step
+    for _ in range(1000):
+        before, now = now, se3.compose(now, se3.invert(before) @ now)
+    assert se3.is_se3(now, tolerance=1e-12)
+
+
 def test_chain_rebuilds_poses_from_their_increments(rng: np.random.Generator) -> None:
     T_first_k = random_poses(rng, 8)
     T_first_k = se3.invert(T_first_k[0]) @ T_first_k

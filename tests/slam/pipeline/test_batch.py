@@ -6,6 +6,7 @@ import gc
 import threading
 import weakref
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,20 +14,23 @@ import numpy as np
 import pytest
 from oracle import OracleNoise, OraclePredictor
 
+from erfsfm.common.errors import SHOW_TRACEBACK
 from erfsfm.common.progress import Progress, silent
 from erfsfm.inference import DepthPosePredictor
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
-from slam.frames import Frame, Image, Intrinsics
+from slam.frames import Frame, Image, Intrinsics, SnippetPoses
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
+from slam.pipeline import batch
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.prediction.networks import NetworkPredictor
 from slam.runtime.errors import SlamError
+from slam.runtime.storage.record import Missing
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
@@ -108,6 +112,42 @@ def test_exact_predictions_give_the_true_trajectory() -> None:
         np.testing.assert_allclose(each.T_world_camera, turning(60), atol=1e-3)
     assert result.map is None and len(result.drive.steps) == 0
     assert len(result.drive.snippets) == 56 and len(result.factors) == 59
+
+
+class OneBadSnippet(OraclePredictor):
+    """An oracle that once gives no number."""
+
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
+        found = super().snippet(frames)
+        return replace(found, T_source_target=np.nan * found.T_source_target) if found.target == 20 else found
+
+
+def test_a_pose_that_is_no_number_costs_a_gap() -> None:
+    drive = LevelRoad(turning(60))
+    assert drive.reference is not None
+    oracle = OneBadSnippet(drive.reference, road, NO_NOISE, FACTOR)
+    result = SlamPipeline(drive, oracle, load_config(None, NO_IMAGES)).run()
+    assert [snippet.target for snippet in result.drive.trusted] == [*range(2, 20), *range(21, 58)]
+    assert ate(result.optimised, result.reference) < 0.1
+
+
+@pytest.mark.parametrize("stage", ["close_loops", "PoseGraph"])
+def test_an_error_in_loops_or_graph_costs_these(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise KeyError(7)
+
+    drive, kept = LevelRoad(turning(30)), []
+    assert drive.reference is not None
+    pipeline = SlamPipeline(drive, OraclePredictor(drive.reference, road), load_config(None, NO_IMAGES))
+    monkeypatch.setattr(batch, stage, failing)
+    result = pipeline.estimate(keep=lambda name, trajectory: kept.append((name, len(trajectory))))
+    assert kept == [("reference", 30), ("network", 30), ("odometry", 30)]
+    assert result.loops.not_sought is not None and "KeyError: 7 (test_batch.py:" in result.loops.not_sought
+    assert isinstance(result.graph, Missing) == (stage == "PoseGraph")
+    assert ate(result.optimised, result.reference) < 1e-3
+    monkeypatch.setenv(SHOW_TRACEBACK, "1")
+    with pytest.raises(KeyError):
+        pipeline.estimate()
 
 
 def test_scale_drift_is_corrected_by_the_ground_plane() -> None:

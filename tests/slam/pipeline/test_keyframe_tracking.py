@@ -13,6 +13,8 @@ from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, Sl
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.gap_interpolation import complete_drive
+from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
@@ -64,6 +66,11 @@ KEYFRAMES_ALONE = SlamConfig(
 )
 
 
+def completed(observer: Observer) -> Drive:
+    maps = observer.maps()
+    return complete_drive(observer.drive, 4, maps, keyframe_poses(maps, room.INTRINSICS))
+
+
 @pytest.mark.parametrize("stands", [False, True])
 def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
     """Before their map begins and over a gap, not beside repeated images: the map tells whether the camera stood."""
@@ -76,12 +83,12 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
         for k, T in enumerate(truth):
             frame = room.frame(k, T)
             observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
-        closed, _ = observer.complete_drive()
-    started = min(closed.map_poses.segments)
-    assert started < 10 and len(closed.map_poses.segments) == 40 - len(blank) - started
+        drive = completed(observer)
+    started = min(drive.map_poses.segments)
+    assert started < 10 and len(drive.map_poses.segments) == 40 - len(blank) - started
     late = [motion.ends for motion in observer.drive.motions if motion.ends[0] > 19]
     assert late == [(23, 26)]
-    assert set(closed.interpolated) == {*blank, *(() if stands else repeated)}
+    assert set(drive.interpolated) == {*blank, *(() if stands else repeated)}
 
 
 @pytest.mark.parametrize("interrupted", [(), (19, 21), (20, 22)])
@@ -100,13 +107,13 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
             observer.add(k, room.frame(k, T))
             if k in interrupted:
                 observer.state()
-        state, (closed, _) = observer.state(), observer.complete_drive()
+        state, drive = observer.state(), completed(observer)
     assert state.keyframes is not None
     keyframes = state.keyframes.segments[-1].map.keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
     assert [k for k in predicted if k >= 20] == [keyframe.index for keyframe in keyframes if keyframe.index >= 20]
-    assert [snippet.target for snippet in closed.trusted if snippet.target > 18] == [22, 26, 30, 34]
-    assert len(closed.trusted[0].sources) == 4 and not closed.interpolated
+    assert [snippet.target for snippet in drive.trusted if snippet.target > 18] == [22, 26, 30, 34]
+    assert len(drive.trusted[0].sources) == 4 and not drive.interpolated
 
 
 @pytest.mark.parametrize("camera_height_m", [None, 1.65])

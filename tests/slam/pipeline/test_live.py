@@ -19,7 +19,7 @@ from oracle import OracleNoise, OraclePredictor
 from slam import Slam
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import DepthMap, Frame, SnippetPoses
-from slam.geometry.se3 import apply
+from slam.geometry.se3 import apply, is_se3
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.runtime.errors import SlamError
@@ -154,6 +154,14 @@ def test_blank_frames_are_interpolated() -> None:
     reference = drive().reference
     assert reference is not None
     assert np.linalg.norm(slam.trajectory().positions - reference[:30, :3, 3], axis=1).max() < 3.0
+
+
+def test_the_camera_stays_rigid_over_a_gap_longer_than_its_window() -> None:
+    slam = started(load_config(None, SETTINGS))
+    feed(slam, 0, 12)
+    for k in range(12, 200):
+        slam.add_frame(np.zeros((96, 312, 3), np.uint8), float(drive().stamps[k]))
+    assert is_se3(slam.trajectory().T_world_camera, tolerance=1e-12)
 
 
 def test_wrong_frames_and_modes_are_refused() -> None:

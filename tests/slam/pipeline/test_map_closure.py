@@ -9,7 +9,7 @@ import pytest
 import room
 from numpy.typing import NDArray
 
-from slam.config.sections import KeyframesConfig, LoopsConfig, SlamConfig
+from slam.config.sections import KeyframesConfig, SlamConfig
 from slam.frames import RelativeSimilarity, View
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
@@ -18,6 +18,7 @@ from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.loops import maps
 from slam.loops.maps import MapLoop, MapLoops, find_map_loops
+from slam.loops.verification import RejectedLoop
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
@@ -44,7 +45,8 @@ def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometryState]:
 
 
 def closed(state: KeyframeOdometryState) -> MapClosure:
-    return close_maps(state.segments, room.INTRINSICS, CONFIG.loops)
+    maps = [segment for segment in state.segments if segment.started]
+    return close_maps(maps, keyframe_poses(maps, room.INTRINSICS), room.INTRINSICS)
 
 
 def errors(found: KeyframePoses, truth: FloatArray) -> tuple[float, float]:
@@ -151,8 +153,10 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
             if k not in sparse:
                 tracking.learn(frame, depth)
         resumed = KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, resumed.state())
-    assert [each.frame for each in going_on.events if each.event == "relocalised"] == relocalised
-    assert going_on.events == resumed.events
+    states = going_on.state(), resumed.state()
+    assert states[0] is not None and states[1] is not None
+    assert [each.frame for each in states[0].events if each.event == "relocalised"] == relocalised
+    assert states[0].events == states[1].events
 
 
 def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,6 +190,14 @@ def test_another_scene_is_no_loop() -> None:
     assert len(set(after.poses.segments.values())) == 2
 
 
+def test_a_rejected_loop_from_a_map_without_poses_has_a_length() -> None:
+    loop = RejectedLoop(0, 5, "few corners", 0.5, 9, from_rotation_vector(np.zeros(3), np.ones(3)))
+    scale = Scale("none", MeasurementFailure("no road"), np.full(6, 3.0), {}, "the networks' own unit")
+    (rejected,) = MapClosure(KeyframePoses(), rejected=(loop,), learned_units={0: 2.0}).closures(scale).rejected
+    assert rejected.T_from_to is not None
+    np.testing.assert_array_equal(rejected.T_from_to[:3, 3], 6.0)
+
+
 @pytest.mark.data
 @pytest.mark.slow
 def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
@@ -202,7 +214,7 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
         odometry.learn(frame, flat)
     maps = odometry.state().segments
     before = keyframe_poses(maps, sequence.intrinsics)
-    after = close_maps(maps, sequence.intrinsics, LoopsConfig())
+    after = close_maps(maps, before, sequence.intrinsics)
     T_world_camera = np.tile(np.eye(4), (len(truth), 1, 1))
     T_world_camera[:, :3] = truth
     assert sorted(before.segments) == list(range(80))

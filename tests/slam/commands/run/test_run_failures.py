@@ -175,6 +175,40 @@ def test_a_disk_that_is_full_at_the_map(kitti_root: Path, tmp_path: Path, capfd:
     assert len(read_ply(tmp_path / "up.ply").vertices) == len(read_ply(whole / "map_mesh.ply").vertices)
 
 
+@pytest.mark.parametrize("stage", ["loops", "graph", "map", "report"])
+def test_a_stage_that_fails_costs_its_results(
+    stage: str,
+    quick: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise KeyError(0)
+
+    place = {
+        "loops": "slam.pipeline.batch.close_loops",
+        "graph": "slam.graph.pose_graph.PoseGraph.optimise",
+        "map": "slam.pipeline.batch.SlamPipeline.fuse",
+        "report": "slam.commands.run.job.write_report",
+    }
+    monkeypatch.setattr(place[stage], failing)
+    words = ["--dataset", quick["dataset"], "--weights", quick["weights"], "--frames", "0:8"]
+    assert call("run", *words, "--set", "visual_odometry.enabled=false", "--output", tmp_path / "run") == 0
+    assert "failed: unexpected KeyError: 0 (test_run_failures.py:" in caplog.text
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["status"] == "ok" and metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+    lost = {
+        "loops": [("loops", "accepted")],
+        "graph": [("loops", "accepted"), ("graph", "nodes")],
+        "map": [("map", "triangles")],
+    }
+    for part, name in lost.get(stage, []):
+        assert metrics[part][name] is None and "KeyError" in metrics[part][f"{name}_reason"]
+    assert (tmp_path / "run/report.html").is_file() == (stage != "report")
+    assert (tmp_path / "run/graph.g2o").is_file() == (stage != "graph")
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_terminated_run_has_its_reason(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

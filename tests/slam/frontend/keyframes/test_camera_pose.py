@@ -3,7 +3,7 @@ import numpy as np
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.camera_pose import resect
 from slam.geometry.projection import pixel_jacobian
-from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, rotation_angle
+from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, is_se3, rotation_angle
 
 INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 T_TRUE = from_rotation_vector(np.array([0.1, -0.2, 0.3]), np.array([0.2, 0.1, -0.3]))
@@ -31,6 +31,21 @@ def test_finds_the_pose_from_a_far_guess() -> None:
     pose = resect((np.eye(4),), points, pixels, INTRINSICS)
     np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-6)
     assert pose.residual_px.max() < 1e-3
+
+
+def test_a_camera_that_moves_and_turns_steadily_stays_rigid() -> None:
+    """Each pose begins at the one predicted by the last two, which fits."""
+    rng = np.random.default_rng(1)
+    T_step = from_rotation_vector(np.array([0.002, 0.02, 0.001]), np.array([0.01, 0.0, -0.03]))
+    true = before = now = np.eye(4)
+    for _ in range(1000):
+        true = T_step @ true
+        points = rng.uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 6.0), (40, 3))
+        predicted = now @ invert(before) @ now
+        found = resect((predicted,), apply(invert(true), points), INTRINSICS.project(points), INTRINSICS)
+        before, now = now, found.T_camera_world
+    assert is_se3(now, tolerance=1e-12)
+    assert rotation_angle(now[:3, :3] @ true[:3, :3].T) < 1e-6
 
 
 def test_a_wrong_prediction_does_not_outweigh_the_last_pose() -> None:

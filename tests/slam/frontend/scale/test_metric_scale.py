@@ -40,7 +40,7 @@ def measured(
     road=True, planes=True, bias: float = 1.0, lidar: int = 0, height_m: float = HEIGHT_M, steps=SINGLE
 ) -> tuple[Drive, list[RelativePose]]:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
-    motions = [Motion(step(ends, UNIT, "essential"), np.zeros(3)) for ends in steps]
+    motions = [Motion(step(ends, UNIT, "essential"), np.eye(6)) for ends in steps]
     plane: GroundPlane | MeasurementFailure = (
         GroundPlane(bias * HEIGHT_M * UNIT, DOWN, 1.0) if planes else MeasurementFailure("dark")
     )

@@ -60,8 +60,8 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
     turns = correction.reshape(-1, 3)
     T_current_previous[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ T_current_previous[:, :3, :3]
     covariances = np.array([motion.covariance for motion in motions.values()])
-    by_information = np.linalg.solve(covariances[:, :3, :3], turns[:, :, None])
-    T_current_previous[:, :3, 3] = _turned(T_current_previous[:, :3, 3], (covariances[:, 3:, :3] @ by_information)[..., 0])
+    moves = covariances[:, 3:, :3] @ np.linalg.solve(covariances[:, :3, :3], turns[:, :, None])
+    T_current_previous[:, :3, 3] = _turned(T_current_previous[:, :3, 3], moves[:, :, 0])
     smoothed = zip(motions.items(), invert(T_current_previous), strict=True)
     return table.replaced({ends: motion.with_pose(T) for (ends, motion), T in smoothed})
 

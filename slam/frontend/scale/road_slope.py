@@ -48,7 +48,7 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: StepTable) -> dict[En
 
 def _path_directions(steps: StepTable, reach: float) -> dict[int, FloatArray]:
     """The direction ``(3,)`` of the path within ``reach`` of a frame, in its camera, by the frame."""
-    found = {}
+    found: dict[int, FloatArray] = {}
     for run in _runs(steps):
         T = chain(np.array([steps.motions[ends].relative_pose.T_from_to for ends in run]))
         places = path_distance(T)

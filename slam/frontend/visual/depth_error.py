@@ -115,7 +115,7 @@ class DepthError:
     def _spread(self) -> FloatArray:
         seen = 0.5 * (self._quantile(0.84) - self._quantile(0.16))
         noise = self.noise / (self.corners.sum(axis=1) + _PRIOR_CORNERS)
-        return np.sqrt(np.maximum(seen**2 - noise, _LEAST_SIGMA**2))
+        return np.asarray(np.sqrt(np.maximum(seen**2 - noise, _LEAST_SIGMA**2)))
 
     @property
     def total_spread(self) -> float | None:

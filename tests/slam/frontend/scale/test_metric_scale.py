@@ -44,7 +44,7 @@ def measured(
     plane: GroundPlane | MeasurementFailure = (
         GroundPlane(bias * HEIGHT_M * UNIT, DOWN, 1.0) if planes else MeasurementFailure("dark")
     )
-    roads = {ends: RoadStep(metres(ends) / height_m, 0.06, DOWN) for ends in steps} if road else {}
+    roads = {ends: RoadStep(metres(ends) / height_m * DOWN, np.eye(3), DOWN, 0.06) for ends in steps} if road else {}
     scans = [step(ends, 1.0, "lidar") for ends in SINGLE[:lidar]]
     return Drive(roads=[plane] * FRAMES, motions=motions, road_steps=roads), scans
 

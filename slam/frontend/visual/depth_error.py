@@ -29,6 +29,7 @@ _KEPT = 0.98
 _PRIOR_CORNERS = 40.0
 _PRIOR_SIGMA = 0.2
 _LEAST_SIGMA = 0.1
+_USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
 
 
@@ -36,7 +37,7 @@ _USUAL_FAR_SIGMA = 0.25
 class DepthError:
     """Corners of the last steps by learned depth and by log of learned over triangulated depth ``(D, L)``, decayed.
 
-    Those that triangulation hardly measures count less. ``noise`` ``(D,)`` is the sum of its variances.
+    Those that triangulation hardly measures count less. ``noise`` ``(D,)`` is the sum of its sigmas.
     """
 
     corners: FloatArray = field(default_factory=lambda: np.zeros((len(_DEPTHS), len(_LOGARITHMS))))
@@ -75,12 +76,12 @@ class DepthError:
             length: of the motion, in the unit of learned depth.
         """
         known = np.isfinite(learned)
-        ratio, variance = learned[known] * nearness[known] / length, (learned[known] * sigma[known] / length) ** 2
-        weights = 1.0 / (1.0 + variance / _USUAL_FAR_SIGMA**2)
+        ratio, spread = (learned[known] * each[known] / length for each in (nearness, sigma))
+        weights = 1.0 / (1.0 + (spread / _USUAL_SIGMA) ** 2)
         corners, noise = _KEPT * self.corners, _KEPT * self.noise
         depths = _nearest(np.log2(learned[known]), np.log2(_DEPTHS))
         np.add.at(corners, (depths, _nearest(np.log(np.maximum(ratio, 1e-9)), _LOGARITHMS)), weights)
-        np.add.at(noise, depths, weights * variance)
+        np.add.at(noise, depths, weights * spread)
         return type(self)(corners, noise)
 
     def most_too_far(self, least: float) -> float | None:
@@ -115,7 +116,7 @@ class DepthError:
     def _spread(self) -> FloatArray:
         seen = 0.5 * (self._quantile(0.84) - self._quantile(0.16))
         noise = self.noise / (self.corners.sum(axis=1) + _PRIOR_CORNERS)
-        return np.asarray(np.sqrt(np.maximum(seen**2 - noise, _LEAST_SIGMA**2)))
+        return np.asarray(np.sqrt(np.maximum(seen**2 - noise**2, _LEAST_SIGMA**2)))
 
     @property
     def total_spread(self) -> float | None:

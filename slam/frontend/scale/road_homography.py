@@ -35,8 +35,10 @@ _Layer = NDArray[np.float32]
 _FAR_HEIGHTS = 9.0  # farthest ground used, in camera heights
 _HALF_WIDTH_HEIGHTS = 1.0  # half the width of the strip of ground used, in camera heights
 _NEAR_HALF_WIDTH_HEIGHTS = 2.0  # half the width of the short strip, in camera heights
-_NEAR_RELATIVE_SIGMA = 0.1  # least relative sigma of a length from the short strip
-_RELATIVE_SIGMA = 0.06  # least relative sigma of a length
+# relative sigmas of independent errors that add up as those of neighbouring lengths do, which are correlated; single
+# lengths err by a third to a half of it
+_NEAR_RELATIVE_SIGMA = 0.1  # from the short strip
+_RELATIVE_SIGMA = 0.06
 _POINTS = 2500  # approximate number of aligned pixels
 _MIN_POINTS = 300  # least number of aligned pixels of a measurement
 _TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees

@@ -222,7 +222,7 @@ class RoadHomography:
 
 @dataclass(frozen=True)
 class _Shape:
-    """Length and half width of a strip of road, in camera heights, and the least relative sigma of its step lengths."""
+    """Length and half width of a strip of road, in camera heights, and the relative sigma of its step lengths."""
 
     far_heights: float
     half_width_heights: float

@@ -173,9 +173,9 @@ class View:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def scaled(self, factor: float) -> View:
-        """The same view with its points in another unit."""
-        return replace(self, points=self.points * np.float32(factor))
+    def scaled(self, factor: float | FloatArray) -> View:
+        """The same view with the points along their rays by a factor, one for all or one each ``(M,)``."""
+        return replace(self, points=self.points * np.asarray(factor, np.float32)[..., None])
 
 
 @dataclass(frozen=True)

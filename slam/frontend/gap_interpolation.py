@@ -14,6 +14,7 @@ from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import calibrate_network, network_steps
 from slam.frontend.rotation_smoothing import smooth_rotations
+from slam.frontend.scale.road_slope import with_slope
 from slam.frontend.segments import find_cuts, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
@@ -39,7 +40,9 @@ def complete_drive(
     map_poses: KeyframePoses = _NO_MAPS,
     events: Sequence[TrackingEvent] = (),
 ) -> Drive:
-    """The drive with its gaps interpolated, its rotations smoothed, and its segments; more frames may follow.
+    """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
+
+    More frames may follow.
 
     Args:
         drive: as collected; it stays as it is.
@@ -54,9 +57,11 @@ def complete_drive(
     measured = {*drive.steps.motions, *map_poses.steps}
     cuts = find_cuts(drive.failures, measured, {*drive.unusable, *drive.repeated})
     filled = interpolate_gaps(drive, sources, cuts, map_poses)
+    smoothed = smooth_rotations(filled.steps, drive.relative_rotations)
     return replace(
         filled,
-        motions=list(smooth_rotations(filled.steps, drive.relative_rotations)),
+        motions=list(smoothed),
+        road_steps=with_slope(drive.road_steps, smoothed),
         segments=find_segments(len(drive), cuts, filled.interpolated, map_poses.relates),
         maps=list(maps),
         map_poses=map_poses,

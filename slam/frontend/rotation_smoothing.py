@@ -1,7 +1,8 @@
-"""Rotations of single steps corrected by relative rotations across several steps.
+"""Rotations of single steps corrected by relative rotations across several steps, and directions with them.
 
 The tracking error of a corner is the same over two steps as over one, and a drift of its window is a bias of every
-step. Measured between frames two steps apart, the same error enters half as often
+step. Measured between frames two steps apart, the same error enters half as often. Corners that turn the camera too
+far move it to the other side: the direction of a step is corrected by as much as its covariance with the rotation says
 (``docs/design/visual-front-end.md``).
 """
 
@@ -27,7 +28,7 @@ _BLOCK = np.arange(9)
 
 
 def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRotation]) -> StepTable:
-    """The table with rotations fitted robustly to single steps and relative rotations.
+    """The table with rotations fitted robustly to single steps and relative rotations, directions corrected alike.
 
     Least squares over one small rotation for each triangulated step, in its current camera. The residual of a
     relative rotation is the sum of the corrections of its steps, each in its last camera.
@@ -56,11 +57,20 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
         weights = np.repeat(1.0 / (1.0 + (residual / _OUTLIER_SIGMAS) ** 2), 3) / overlapping
         weighted = A.multiply(weights[:, None]).T.tocsr()
         correction = np.atleast_1d(spsolve((weighted @ A + prior).tocsc(), weighted @ target))
-    T_current_previous[:, :3, :3] = (
-        Rotation.from_rotvec(correction.reshape(-1, 3)).as_matrix() @ T_current_previous[:, :3, :3]
-    )
+    turns = correction.reshape(-1, 3)
+    T_current_previous[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ T_current_previous[:, :3, :3]
+    covariances = np.array([motion.covariance for motion in motions.values()])
+    moves = covariances[:, 3:, :3] @ np.linalg.solve(covariances[:, :3, :3], turns[:, :, None])
+    T_current_previous[:, :3, 3] = _turned(T_current_previous[:, :3, 3], moves[:, :, 0])
     smoothed = zip(motions.items(), invert(T_current_previous), strict=True)
     return table.replaced({ends: motion.with_pose(T) for (ends, motion), T in smoothed})
+
+
+def _turned(translations: FloatArray, directions: FloatArray) -> FloatArray:
+    """Translations ``(S, 3)`` with ``directions`` ``(S, 3)`` added to their own, as long as before."""
+    lengths = np.linalg.norm(translations, axis=1, keepdims=True)
+    turned = translations + lengths * directions
+    return np.asarray(turned * lengths / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
 def _equations(

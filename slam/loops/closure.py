@@ -21,6 +21,7 @@ from slam.runtime.threads import side_by_side
 logger = logging.getLogger(__name__)
 
 MOST_REJECTED = 200
+_SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 
 
 @dataclass(frozen=True)
@@ -108,13 +109,28 @@ def close_loops(
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     path = path_distance(T_world_camera)[np.array([view.index for view in views], dtype=int)]
-    candidates = find_candidates(views, path, least_path(views, is_metric))
+    least = least_path(views, is_metric)
+    candidates = find_candidates(views, path, least)
     thresholds = LoopThresholds.of_frames(config)
     verifier = LoopVerifier(thresholds, intrinsics, seed)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
     refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
-    accepted, lonely = agreeing(verified, T_world_camera, thresholds)
+    kept, lonely = agreeing(verified, T_world_camera, thresholds)
+    accepted = _counted_once(kept, path_distance(T_world_camera), _SAME_PLACE * least)
     logger.info("loops: %d candidates, %d verified, %d accepted", len(candidates), len(verified), len(accepted))
     refused.sort(key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index))
     return LoopClosures(len(candidates), len(verified), tuple(accepted), tuple(lonely + refused))
+
+
+def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[Loop]:
+    """The loops with the sigmas of one loop together wherever several join the same two places, of a car that waits.
+
+    Args:
+        loops: that are accepted.
+        path: distance driven up to each frame ``(N,)``.
+        near: along it, within which two frames show the same place with the same errors.
+    """
+    ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
+    alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
+    return [loop.widened(float(np.sqrt(count))) for loop, count in zip(loops, alike, strict=True)]

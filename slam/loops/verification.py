@@ -39,6 +39,10 @@ class Loop:
         """Earlier and later frame."""
         return self.measured.from_index, self.measured.to_index
 
+    def widened(self, factor: float) -> Loop:
+        """The same loop with larger sigmas."""
+        return replace(self, measured=replace(self.measured, sigmas=factor * self.measured.sigmas))
+
     def refused(self, reason: str) -> RejectedLoop:
         """The same loop, rejected for a reason."""
         return RejectedLoop(*self.ends, reason, self.score, self.inliers, self.measured.T_from_to)

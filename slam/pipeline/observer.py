@@ -256,7 +256,9 @@ class Observer:
         views, loops = self._drive.views, self._config.loops
         if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
             with self._stopwatch.stage("loops"):
-                views.append(self._features.view(frame, depth, height))
+                view = self._features.view(frame, depth, height)
+                learned = view.points[:, 2].astype(np.float64)
+                views.append(view.scaled(self._odometry.state().depth_error.corrected(learned) / learned))
         self._keep(frame, depth)
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:

@@ -12,7 +12,7 @@ one: lengths came out 1 % short.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,11 +35,13 @@ _Layer = NDArray[np.float32]
 _FAR_HEIGHTS = 9.0  # farthest ground used, in camera heights
 _HALF_WIDTH_HEIGHTS = 1.0  # half the width of the strip of ground used, in camera heights
 _NEAR_HALF_WIDTH_HEIGHTS = 2.0  # half the width of the short strip, in camera heights
-_NEAR_RELATIVE_SIGMA = 0.1  # least relative sigma of a length from the short strip
-_RELATIVE_SIGMA = 0.06  # least relative sigma of a length
+# relative sigmas of independent errors that add up as those of neighbouring lengths do, which are correlated; single
+# lengths err by a third to a half of it
+_NEAR_RELATIVE_SIGMA = 0.1  # from the short strip
+_RELATIVE_SIGMA = 0.06
 _POINTS = 2500  # approximate number of aligned pixels
 _MIN_POINTS = 300  # least number of aligned pixels of a measurement
-_TILT_SIGMA_DEG = 0.1  # sigma of the ground plane's tilt against the direction of motion, degrees
+_TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees
 _MAX_TILT_DEG = 4.0  # largest tilt of the ground plane, degrees
 _MIN_CORRELATION = 0.3  # least correlation of the aligned pixels
 _MIN_GAIN = 0.25  # least fraction of the photometric error without motion that the alignment removes
@@ -47,11 +49,26 @@ _MIN_GAIN = 0.25  # least fraction of the photometric error without motion that 
 
 @dataclass(frozen=True)
 class RoadStep:
-    """``length_heights`` of a step with its relative sigma, and the road's ``normal`` ``(3,)``, down, unit."""
+    """What the images of the road say of the vector ``m`` ``(3,)`` of a step, whose norm is its length in heights.
 
-    length_heights: float
+    ``information`` ``(3, 3)`` and ``right`` ``(3,)`` are their normal equations, without what is expected of the road's
+    normal; ``plane`` is their solution with it. ``relative_sigma`` is that of the length.
+    """
+
+    plane: FloatArray
+    information: FloatArray
+    right: FloatArray
     relative_sigma: float
-    normal: FloatArray
+
+    @property
+    def length_heights(self) -> float:
+        """Length of the step, in camera heights."""
+        return float(np.linalg.norm(self.plane))
+
+    def along(self, direction: FloatArray) -> RoadStep:
+        """The same where a car goes in a ``direction`` ``(3,)`` of the later camera, parallel to its road."""
+        plane = _solved(self.information, self.right, _normal_along(direction), self.length_heights)
+        return replace(self, plane=plane)
 
 
 class RoadHomography:
@@ -112,7 +129,8 @@ class RoadHomography:
     ) -> RoadStep | MeasurementFailure:
         if len(strip.rows) < _MIN_POINTS:
             return MeasurementFailure("the image shows too little of the road")
-        plane, correlation, standing = self._aligned(strip, previous, current, T_unit, expected)
+        step, correlation, standing = self._aligned(strip, previous, current, T_unit, expected)
+        plane = step.plane
         length = float(np.linalg.norm(plane))
         normal = plane / length
         deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
@@ -122,31 +140,26 @@ class RoadHomography:
             return MeasurementFailure(f"both images of the road do not correlate ({correlation:.2f})")
         if 1.0 - correlation > (1.0 - _MIN_GAIN) * (1.0 - standing):
             return MeasurementFailure(f"the image in front of the car stands still (correlation {standing:.2f})")
-        return RoadStep(length, strip.shape.relative_sigma, normal)
+        return step
 
     def _aligned(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
-    ) -> tuple[FloatArray, float, float]:
-        """The plane ``m`` ``(3,)`` that aligns the road, and the correlation of both images with and without it."""
-
+    ) -> tuple[RoadStep, float, float]:
+        """The step that aligns the road, and the correlation of both images with and without it."""
         before, now = self._layers(previous), self._layers(current)
         plane = self._search(strip, before[0], now[0], T_unit, expected)
         for layer_before, layer_now in zip(before, now, strict=True):
-            plane, correlation = self._refine(
-                strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(_TILT_SIGMA_DEG))
-            )
+            step, correlation = self._refine(strip, layer_before, layer_now, T_unit, plane, expected)
+            plane = step.plane
         standing = _correlation(*(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now)))
-        return plane, correlation, standing
+        return step, correlation, standing
 
     def _expected(self) -> FloatArray:
         """The expected normal ``(3,)``: that of a level camera, pitched so that the motion is parallel to the road.
 
         The images alone determine pitch and length poorly; the direction of motion determines pitch well.
         """
-        direction = np.median(self._directions, axis=0)
-        along = direction / max(float(np.linalg.norm(direction)), 1e-9)
-        normal = _LEVEL - (_LEVEL @ along) * along
-        return np.asarray(normal / np.linalg.norm(normal))
+        return _normal_along(np.median(self._directions, axis=0))
 
     def _layers(self, frame: Frame) -> list[_Layer]:
         """A coarse image ``(H', W, 3)`` below the horizon, high-pass filtered, and the image, both with gradients."""
@@ -184,13 +197,11 @@ class RoadHomography:
         T_unit: FloatArray,
         plane: FloatArray,
         expected: FloatArray,
-        tilt: float,
-    ) -> tuple[FloatArray, float]:
+    ) -> tuple[RoadStep, float]:
         """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also the correlation of both images."""
         fx, fy, (tx, ty, tz) = self._intrinsics.fx, self._intrinsics.fy, T_unit[:3, 3].tolist()
         R, t = _single(T_unit[:3, :3], T_unit[:3, 3])
         rotated, seen = R @ strip.rays, now[strip.rows, strip.columns, 0]
-        across = np.eye(3) - np.outer(expected, expected)
         for _ in range(_ITERATIONS):
             (m,) = _single(plane)
             points = _ahead(rotated + np.outer(t, m @ strip.rays))
@@ -200,18 +211,18 @@ class RoadHomography:
             slope = (slope_x * fx * (tx - x / z * tz) + slope_y * fy * (ty - y / z * tz)) / z
             sigma = max(mad_sigma(residual), 0.3)
             weighted = strip.rays * (slope / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2)))
-            prior = across / (tilt * float(np.linalg.norm(plane))) ** 2
-            information = (weighted * slope) @ strip.rays.T + prior + 1e-9 * np.eye(3)
-            step = -np.linalg.solve(information, weighted @ residual + prior @ plane)
-            plane = plane + step
-            if np.abs(step).max() < _CONVERGED * np.linalg.norm(plane):
+            information = ((weighted * slope) @ strip.rays.T).astype(np.float64)
+            right = information @ plane - weighted @ residual
+            last, plane = plane, _solved(information, right, expected, float(np.linalg.norm(plane)))
+            if np.abs(plane - last).max() < _CONVERGED * np.linalg.norm(plane):
                 break
-        return plane, _correlation(strip.local(grey), strip.local(seen))
+        correlation = _correlation(strip.local(grey), strip.local(seen))
+        return RoadStep(plane, information, right, strip.shape.relative_sigma), correlation
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """Length and half width of a strip of road, in camera heights, and the least relative sigma of its step lengths."""
+    """Length and half width of a strip of road, in camera heights, and the relative sigma of its step lengths."""
 
     far_heights: float
     half_width_heights: float
@@ -263,6 +274,20 @@ def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int, vis
         np.asarray(cv2.GaussianBlur(mask, (0, 0), gradual)),
         gradual,
     )
+
+
+def _normal_along(direction: FloatArray) -> FloatArray:
+    """The normal ``(3,)`` of a road, down, unit, that is level across a ``direction`` ``(3,)`` and parallel to it."""
+    along = direction / max(float(np.linalg.norm(direction)), 1e-9)
+    normal = _LEVEL - (_LEVEL @ along) * along
+    return np.asarray(normal / np.linalg.norm(normal))
+
+
+def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, length: float) -> FloatArray:
+    """The plane ``m`` ``(3,)`` of normal equations and an expected normal, at about that length."""
+    across = np.eye(3) - np.outer(normal, normal)
+    prior = across / (np.deg2rad(_TILT_SIGMA_DEG) * length) ** 2
+    return np.asarray(np.linalg.solve(information + prior + 1e-9 * np.eye(3), right))
 
 
 def _gradual_px(intrinsics: Intrinsics) -> float:

@@ -31,7 +31,7 @@ _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
 _MOST_CORRELATED = 0.999
 _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated points
-# factor on the sigma of a length by learned depth where the road gives it too: that has no errors that neighbours share
+# factor on the sigma of a length by learned depth where the road gives it too, whose errors fewer neighbours share
 _BESIDE_ROAD = 4.0
 _UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
 _UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane

@@ -3,7 +3,7 @@
 Networks see far things too near, and err more the farther they are: on streets that they were not trained on by a third
 beyond 40 m. One scale for all distances would then depend on whether most corners are near or far. So the logarithm of
 learned over triangulated depth is counted by learned depth; its median is the bias that is taken out before depth is
-compared with anything, its spread the sigma (``docs/design/visual-front-end.md``).
+compared with anything, its spread without that of triangulation the sigma (``docs/design/visual-front-end.md``).
 """
 
 from __future__ import annotations
@@ -29,14 +29,19 @@ _KEPT = 0.98
 _PRIOR_CORNERS = 40.0
 _PRIOR_SIGMA = 0.2
 _LEAST_SIGMA = 0.1
+_USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class DepthError:
-    """Corners of the last steps by learned depth and by log of learned over triangulated depth ``(D, L)``, decayed."""
+    """Corners of the last steps by learned depth and by log of learned over triangulated depth ``(D, L)``, decayed.
+
+    Those that triangulation hardly measures count less. ``noise`` ``(D,)`` is the sum of its sigmas.
+    """
 
     corners: FloatArray = field(default_factory=lambda: np.zeros((len(_DEPTHS), len(_LOGARITHMS))))
+    noise: FloatArray = field(default_factory=lambda: np.zeros(len(_DEPTHS)))
 
     def corrected(self, depth: DepthMap | FloatArray) -> FloatArray:
         """Learned depth of any shape without its bias; NaN stays."""
@@ -60,21 +65,24 @@ class DepthError:
         centre = weighted_median(logarithms, weights)
         return float(np.exp(centre)), weighted_median(np.abs(logarithms - centre), weights)
 
-    def with_step(self, learned: FloatArray, nearness: FloatArray, length: float) -> Self:
+    def with_step(self, learned: FloatArray, nearness: FloatArray, sigma: FloatArray, length: float) -> Self:
         """The error after one more step.
 
         Args:
             learned: depth ``(M,)`` of corners on their epipolar lines, NaN where unknown.
-            nearness: 1 over triangulated depth ``(M,)`` in units of the motion's length; 0 or less beyond infinity.
-                Its noise has no bias, that of triangulated depth has.
+            nearness: 1 over triangulated depth ``(M,)`` in units of the motion's length, without bias; 0 or less beyond
+                infinity.
+            sigma: of it ``(M,)``.
             length: of the motion, in the unit of learned depth.
         """
         known = np.isfinite(learned)
-        ratio = learned[known] * nearness[known] / length
-        logarithms = np.log(np.maximum(ratio, 1e-9))
-        corners = _KEPT * self.corners
-        np.add.at(corners, (_nearest(np.log2(learned[known]), np.log2(_DEPTHS)), _nearest(logarithms, _LOGARITHMS)), 1)
-        return type(self)(corners)
+        ratio, spread = (learned[known] * each[known] / length for each in (nearness, sigma))
+        weights = 1.0 / (1.0 + (spread / _USUAL_SIGMA) ** 2)
+        corners, noise = _KEPT * self.corners, _KEPT * self.noise
+        depths = _nearest(np.log2(learned[known]), np.log2(_DEPTHS))
+        np.add.at(corners, (depths, _nearest(np.log(np.maximum(ratio, 1e-9)), _LOGARITHMS)), weights)
+        np.add.at(noise, depths, weights * spread)
+        return type(self)(corners, noise)
 
     def most_too_far(self, least: float) -> float | None:
         """The largest bias towards far, less where the depth there scatters more than usual; None without corners.
@@ -106,7 +114,9 @@ class DepthError:
 
     @cached_property
     def _spread(self) -> FloatArray:
-        return np.maximum(0.5 * (self._quantile(0.84) - self._quantile(0.16)), _LEAST_SIGMA)
+        seen = 0.5 * (self._quantile(0.84) - self._quantile(0.16))
+        noise = self.noise / (self.corners.sum(axis=1) + _PRIOR_CORNERS)
+        return np.asarray(np.sqrt(np.maximum(seen**2 - noise**2, _LEAST_SIGMA**2)))
 
     @property
     def total_spread(self) -> float | None:

@@ -148,10 +148,29 @@ def triangulated_depth(rays_previous: FloatArray, rays_current: FloatArray, unit
 
     From ``z R x + t = z' x'``: the cross product with x' leaves ``z (x' x R x) = -(x' x t)``.
     """
-    current = rays_current.T
-    across = cross(current, unit_pose.R_current_previous @ rays_previous.T)
-    along = -cross(current, unit_pose.direction)
+    across, along = _across_and_along(rays_previous, rays_current, unit_pose)
     return np.asarray((across * along).sum(axis=0) / np.maximum((across**2).sum(axis=0), 1e-18))
+
+
+def triangulated_nearness(
+    rays_previous: FloatArray, rays_current: FloatArray, unit_pose: UnitRelativePose
+) -> tuple[FloatArray, FloatArray]:
+    """1 over z-depth ``(M,)``, 0 or less at and beyond infinity, and its sigma ``(M,)`` by a ray's sigma of 1.
+
+    Linear in the shift of a point, so that noise does not bias it. The inverse of `triangulated_depth` is biased: noise
+    counts as a shift there, and brings far points nearer.
+    """
+    across, along = _across_and_along(rays_previous, rays_current, unit_pose)
+    squared = np.maximum((along**2).sum(axis=0), 1e-18)
+    return np.asarray((across * along).sum(axis=0) / squared), np.asarray(1.0 / np.sqrt(squared))
+
+
+def _across_and_along(
+    rays_previous: FloatArray, rays_current: FloatArray, unit_pose: UnitRelativePose
+) -> tuple[FloatArray, FloatArray]:
+    """The two sides ``(3, M)`` of ``z (x' x R x) = -(x' x t)``."""
+    current = rays_current.T
+    return cross(current, unit_pose.R_current_previous @ rays_previous.T), -cross(current, unit_pose.direction)
 
 
 def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, unit_pose: UnitRelativePose) -> FloatArray:

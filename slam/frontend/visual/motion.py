@@ -17,14 +17,14 @@ _LEAST_RELATIVE_SIGMA = 1e-3
 class Motion:
     """A measured ``relative_pose``, its length by learned depth, unscaled.
 
-    Where corners alone gave rotation and direction, ``direction_sigmas`` ``(3,)`` are the noise of the direction in the
+    Where corners alone gave rotation and direction, ``covariance`` ``(6, 6)`` is that of both in this order, in the
     later camera, radians, and ``length_ratio`` is the log of the length over that of the step before, by points that
     both triangulated, with its sigma; else None. ``seconds`` passed between the frames. ``support`` is the share of the
     earlier frame's corners that were found again and fit the motion.
     """
 
     relative_pose: RelativePose
-    direction_sigmas: FloatArray | None = None
+    covariance: FloatArray | None = None
     length_ratio: tuple[float, float] | None = None
     seconds: float = np.nan
     support: float = np.nan
@@ -37,7 +37,7 @@ class Motion:
     @property
     def is_triangulated(self) -> bool:
         """Whether corners alone gave rotation and direction, so that the length is free."""
-        return self.direction_sigmas is not None
+        return self.covariance is not None
 
     @property
     def length_unscaled(self) -> float:
@@ -51,9 +51,10 @@ class Motion:
         Raises:
             ValueError: its direction was not measured separately from its length.
         """
-        if self.direction_sigmas is None:
+        if self.covariance is None:
             raise ValueError(f"a motion by {self.relative_pose.source} has no separate noise of its direction")
-        return StepNoise(self.relative_pose.sigmas[:3], self.direction_sigmas)
+        sigmas = np.sqrt(np.diag(self.covariance))
+        return StepNoise(sigmas[:3], sigmas[3:])
 
     def with_pose(self, T_from_to: FloatArray) -> Motion:
         """The same with another pose ``(4, 4)``."""

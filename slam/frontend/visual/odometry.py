@@ -23,6 +23,7 @@ from slam.frontend.visual.epipolar import (
     parallax_px,
     rotation_between,
     triangulated_depth,
+    triangulated_nearness,
 )
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, pose_sigmas
@@ -263,12 +264,13 @@ class VisualOdometry:
         state, two_view = self._state, step.two_view
         still = two_view.inliers & (matches.weights > 0.5)
         rays = matches.rays_previous[still], matches.rays_current[still]
-        nearness = 1.0 / triangulated_depth(*rays, two_view.unit_pose)
+        nearness, per_ray = triangulated_nearness(*rays, two_view.unit_pose)
+        sigma = two_view.noise_px / self._intrinsics.fx * per_ray
         self._state = replace(
             state,
             dynamic_mask=state.dynamic_mask.updated(tracks.current, two_view.inliers),
             history=state.history.with_step(two_view.unit_pose, step.inlier_ratio, speed),
-            depth_error=state.depth_error.with_step(learned[still], nearness, step.motion.length_unscaled),
+            depth_error=state.depth_error.with_step(learned[still], nearness, sigma, step.motion.length_unscaled),
             focal_length=state.focal_length.with_step(*rays, two_view.unit_pose, self._intrinsics.fx),
             points=step.points,
         )
@@ -297,7 +299,7 @@ class VisualOdometry:
         # errors of learned depth are correlated in patches: one in ten counts as independent
         spread *= MAD_TO_SIGMA * CORNER_CORRELATION / float(np.sqrt(max(measures.sum() / 10.0, 1.0)))
         T_previous_current = invert(make(unit_pose.R_current_previous, length * unit_pose.direction))
-        rotation, direction = self._essential_sigmas(two_view)
+        covariance = _with_floors(two_view)
         depth_current = depth_in_current(rays_previous, depth_previous, unit_pose)
         solid &= depth_current > 0
         triangulated = TriangulatedPoints(
@@ -306,17 +308,11 @@ class VisualOdometry:
         last, earlier = self._state.last, self._state.points
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
         ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
-        sigmas = pose_sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
+        own, relative = np.sqrt(np.diag(covariance)), max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
+        sigmas = pose_sigmas(T_previous_current, own[:3], own[3:], relative)
         pose = RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE)
-        motion = Motion(pose, direction, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
+        motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)
-
-    def _essential_sigmas(self, two_view: TwoViewEstimate) -> tuple[FloatArray, FloatArray]:
-        """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
-        own = np.sqrt(np.diag(two_view.covariance))
-        rotation = np.hypot(own[:3], np.deg2rad(_ROTATION_FLOOR_DEG))
-        floor = np.deg2rad(_DIRECTION_FLOOR_DEG)
-        return rotation, np.hypot(own[3:], floor * np.sqrt(np.maximum(1.0 - two_view.unit_pose.direction**2, 0.0)))
 
     def _by_points(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | MeasurementFailure:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
@@ -338,3 +334,10 @@ class VisualOdometry:
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
         pose = RelativePose(*ends, invert(resection.T_camera_points), sigmas, PNP_SOURCE)
         return Motion(pose, support=count / tracks.sought)
+
+
+def _with_floors(two_view: TwoViewEstimate) -> FloatArray:
+    """Covariance ``(6, 6)`` of rotation and direction, in the current camera, where GTSAM perturbs."""
+    across = np.maximum(1.0 - two_view.unit_pose.direction**2, 0.0)
+    floors = np.deg2rad(np.concatenate([np.full(3, _ROTATION_FLOOR_DEG), _DIRECTION_FLOOR_DEG * np.sqrt(across)]))
+    return np.asarray(two_view.covariance + np.diag(floors**2))

@@ -79,12 +79,14 @@ class Matches:
 class TwoViewEstimate:
     """A ``unit_pose`` with its noise and support.
 
-    ``covariance`` ``(6, 6)``: rotation then direction, both in the current camera, radians.
+    ``covariance`` ``(6, 6)``: rotation then direction, both in the current camera, radians. ``noise_px`` is the sigma
+    of corners about their epipolar lines.
     ``inliers`` ``(M,)`` marks the corners that fit it, ``agreeing`` ``(M,)`` those whose learned depth fits it too.
     """
 
     unit_pose: UnitRelativePose
     covariance: FloatArray
+    noise_px: float
     inliers: NDArray[np.bool_]
     agreeing: NDArray[np.bool_]
 
@@ -177,7 +179,8 @@ class TwoViewEstimator:
             length = max(length + float(step[5]), 0.2 * length)
         lift = np.zeros((6, 5))
         lift[:3, :3], lift[3:, 3:] = np.eye(3), tangent
-        return TwoViewEstimate(unit_pose, lift @ np.linalg.inv(normal)[:5, :5] @ lift.T, inliers, agreeing)
+        covariance = lift @ np.linalg.inv(normal)[:5, :5] @ lift.T
+        return TwoViewEstimate(unit_pose, covariance, sigma, inliers, agreeing)
 
     def _inliers(
         self, matches: Matches, near: NDArray[np.bool_], shift_px: FloatArray, seen_px: FloatArray, parallax_px: float

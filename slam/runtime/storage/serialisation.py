@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from slam.runtime.errors import RunError
 from slam.runtime.storage.archive import opened_archive
 
-_FORMAT = 9
+_FORMAT = 10
 Tree = Any  # of JSON
 
 

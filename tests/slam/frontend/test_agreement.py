@@ -46,7 +46,7 @@ def noisy(T: np.ndarray) -> np.ndarray:
 )
 def test_lidar_is_compared_with_the_steps_of_the_images(made: Callable[[np.ndarray], np.ndarray], least: float) -> None:
     motions = {
-        (k, k + 1): Motion(RelativePose(k, k + 1, T, np.full(6, 0.01), "essential"), np.full(3, 0.01))
+        (k, k + 1): Motion(RelativePose(k, k + 1, T, np.full(6, 0.01), "essential"), 1e-4 * np.eye(6))
         for k, T in enumerate(STEPS)
     }
     path = LidarPath(np.arange(FRAMES + 1), se3.chain(made(STEPS)))
@@ -66,7 +66,7 @@ def test_lengths_are_compared_with_the_camera_height(implied: float, stated: flo
 
 def test_disparity_that_is_read_as_depth_is_doubtful() -> None:
     true = np.exp(np.random.default_rng(0).uniform(np.log(4), np.log(40), 400))
-    right, inverse = (DepthError().with_step(learned, 1 / true, 1.0) for learned in (true, 40 / true))
+    right, inverse = (DepthError().with_step(learned, 1 / true, 0.0 * true, 1.0) for learned in (true, 40 / true))
     assert agreement.of_depth("png:depth", DepthError()) is None
     sigmas = [found.sigmas for error in (right, inverse) if (found := agreement.of_depth("png:depth", error))]
     assert sigmas[0] < 1 and sigmas[1] > agreement.DOUBTFUL
@@ -78,7 +78,7 @@ def driven(
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
     drive = Drive(
-        motions=[Motion(pose, np.full(3, 0.01), support=support) for pose in poses],
+        motions=[Motion(pose, 1e-4 * np.eye(6), support=support) for pose in poses],
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
         roads=[MeasurementFailure("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],

@@ -35,7 +35,7 @@ def pose(first: int, last: int, source: str = "essential", T: FloatArray = TRUE)
 
 
 def motions(steps: list[Ends], T: FloatArray) -> list[Motion]:
-    return [Motion(pose(*ends, T=T), np.full(3, 0.002)) for ends in steps]
+    return [Motion(pose(*ends, T=T), 0.002**2 * np.eye(6)) for ends in steps]
 
 
 def snippets(T: FloatArray) -> list[SnippetPoses]:

@@ -32,11 +32,13 @@ def true_rotations(rng: np.random.Generator) -> list[FloatArray]:
     ]
 
 
-def table_of(rotations: Mapping[Ends, FloatArray]) -> StepTable:
-    """Triangulated steps with these ``R_current_previous``."""
+def table_of(rotations: Mapping[Ends, FloatArray], correlation: float = 0.0) -> StepTable:
+    """Triangulated steps with these ``R_current_previous``; turning right by an angle moves them right by two."""
     sigmas = np.repeat([SIGMA, 0.01], 3)
+    covariance = SIGMA**2 * np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])
+    covariance[1, 3] = covariance[3, 1] = 2.0 * correlation * SIGMA**2
     return StepTable.of(
-        Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), np.zeros(3))
+        Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), covariance)
         for ends, R in rotations.items()
     )
 
@@ -126,14 +128,20 @@ def test_steps_that_are_not_triangulated_stay_and_are_not_crossed() -> None:
         np.testing.assert_array_equal(R, rotations_of(smoothed)[ends])
 
 
-def test_translations_stay_as_the_current_camera_sees_them() -> None:
-    steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
-    smoothed = smooth_rotations(steps, across)
-    for before, after in zip(steps, smoothed, strict=True):
-        assert np.abs(after.relative_pose.T_from_to[:3, :3] - before.relative_pose.T_from_to[:3, :3]).max() > 0
-        seen = invert(after.relative_pose.T_from_to)[:3, 3]
-        np.testing.assert_allclose(seen, T_CURRENT_PREVIOUS, atol=1e-12)
-        np.testing.assert_array_equal(after.relative_pose.sigmas, before.relative_pose.sigmas)
+def test_directions_follow_rotations_as_far_as_they_are_correlated() -> None:
+    biased, across, _ = drive(np.array([0.0, SIGMA, 0.0]), 0.1 * SIGMA)
+    for correlation in (0.0, 0.9):
+        steps = table_of(rotations_of(biased), correlation)
+        smoothed = smooth_rotations(steps, across)
+        for before, after in zip(steps, smoothed, strict=True):
+            R, R_before = (invert(motion.relative_pose.T_from_to)[:3, :3] for motion in (after, before))
+            turned = Rotation.from_matrix(R @ R_before.T).as_rotvec()[1]
+            seen = invert(after.relative_pose.T_from_to)[:3, 3]
+            assert np.abs(turned) > 0.1 * SIGMA
+            assert np.linalg.norm(seen) == pytest.approx(np.linalg.norm(T_CURRENT_PREVIOUS))
+            moved = (seen - T_CURRENT_PREVIOUS)[0] / np.linalg.norm(T_CURRENT_PREVIOUS)
+            assert moved == pytest.approx(2.0 * correlation * turned, rel=0.02, abs=1e-12)
+            np.testing.assert_array_equal(after.relative_pose.sigmas, before.relative_pose.sigmas)
 
 
 def test_steps_that_skip_frames_are_smoothed_like_others() -> None:

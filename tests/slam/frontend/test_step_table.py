@@ -14,7 +14,7 @@ from slam.geometry.se3 import from_rotation_vector
 def motion(first: int, last: int, length: float = 1.0, is_triangulated: bool = True) -> Motion:
     T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, length]))
     if is_triangulated:
-        return Motion(RelativePose(first, last, T, np.full(6, 0.01), "essential"), np.zeros(3))
+        return Motion(RelativePose(first, last, T, np.full(6, 0.01), "essential"), np.eye(6))
     return Motion(RelativePose(first, last, T, np.full(6, 0.01), "pnp"))
 
 

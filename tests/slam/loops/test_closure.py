@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import LoopsConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
-from slam.frames import Frame
+from slam.frames import Frame, View
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.closure import MOST_REJECTED, close_loops
 from slam.loops.descriptors import FeatureExtractor
@@ -89,6 +90,24 @@ def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
     metric = {loop.ends for loop in result.loops.accepted}
     assert len(metric) >= 5
     assert metric == ends(0.05) == ends(20.0)
+
+
+def test_a_car_that_waits_at_a_place_has_one_loop_there() -> None:
+    """It stands where a loop ends, for 20 views of the same image, whose loops say the same again and again."""
+    sequence, result = closed(610)
+    loop = result.loops.accepted[-1]
+    T = result.odometry.T_world_camera[: loop.ends[1] + 1]
+    views = [view for view in result.views if view.index < len(T)]
+    waiting = [replace(views[-1], index=len(T) + 3 * k) for k in range(20)]
+    stands = np.concatenate([T, np.repeat(T[-1:], 60, axis=0)])
+
+    def information(T_world_camera: FloatArray, seen: list[View]) -> FloatArray:
+        found = close_loops(seen, T_world_camera, sequence.intrinsics, LoopsConfig(), is_metric=True).accepted
+        there = [one.measured.sigmas for one in found if one.ends[1] >= loop.ends[1]]
+        assert len(there) > (len(T_world_camera) - len(T)) / 6
+        return np.sum([sigmas**-2.0 for sigmas in there], axis=0)
+
+    np.testing.assert_allclose(information(stands, views + waiting), information(T, views), rtol=0.3)
 
 
 def test_a_straight_drive_has_no_loop() -> None:

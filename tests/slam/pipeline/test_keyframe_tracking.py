@@ -32,7 +32,7 @@ def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
     for k in range(count):
         T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
         pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
-        motions.append(Motion(pose, np.ones(3), seconds=seconds))
+        motions.append(Motion(pose, np.eye(6), seconds=seconds))
     return Drive(motions=motions, roads=[GroundPlane(1.0, np.array([0.0, 1.0, 0.0]), 1.0)] * count)
 
 

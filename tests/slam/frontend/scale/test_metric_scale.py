@@ -40,11 +40,11 @@ def measured(
     road=True, planes=True, bias: float = 1.0, lidar: int = 0, height_m: float = HEIGHT_M, steps=SINGLE
 ) -> tuple[Drive, list[RelativePose]]:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
-    motions = [Motion(step(ends, UNIT, "essential"), np.zeros(3)) for ends in steps]
+    motions = [Motion(step(ends, UNIT, "essential"), np.eye(6)) for ends in steps]
     plane: GroundPlane | MeasurementFailure = (
         GroundPlane(bias * HEIGHT_M * UNIT, DOWN, 1.0) if planes else MeasurementFailure("dark")
     )
-    roads = {ends: RoadStep(metres(ends) / height_m, 0.06, DOWN) for ends in steps} if road else {}
+    roads = {ends: RoadStep(metres(ends) / height_m * DOWN, np.eye(3), DOWN, 0.06) for ends in steps} if road else {}
     scans = [step(ends, 1.0, "lidar") for ends in SINGLE[:lidar]]
     return Drive(roads=[plane] * FRAMES, motions=motions, road_steps=roads), scans
 

@@ -72,7 +72,7 @@ def test_length_is_measured_in_camera_heights(texture, length_m, turn_deg, pitch
     road = measure(texture, step, pitch_deg)
     assert isinstance(road, RoadStep)
     assert road.length_heights * HEIGHT_M == pytest.approx(length_m, rel=0.02)
-    assert np.rad2deg(np.arctan2(road.normal[2], road.normal[1])) == pytest.approx(pitch_deg, abs=0.3)
+    assert np.rad2deg(np.arctan2(road.plane[2], road.plane[1])) == pytest.approx(pitch_deg, abs=0.3)
     assert 0.06 <= road.relative_sigma < 0.12
 
 

@@ -100,7 +100,7 @@ def test_steps_that_nothing_measured_have_no_length():
 def motion(ends: Ends, metres: float, unit: float, ratio: float, seconds: float = np.nan) -> Motion:
     """A step, whose ratio to the one before is measured."""
     T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, unit * metres]))
-    return Motion(RelativePose(*ends, T, np.full(6, 0.01), "essential"), np.zeros(3), (np.log(ratio), 0.01), seconds)
+    return Motion(RelativePose(*ends, T, np.full(6, 0.01), "essential"), np.eye(6), (np.log(ratio), 0.01), seconds)
 
 
 def test_evidence_has_a_row_a_link_also_where_steps_skip_frames() -> None:

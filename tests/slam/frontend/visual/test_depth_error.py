@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.epipolar import UnitRelativePose, triangulated_nearness
 
 NOISE_PX = 0.2
 
@@ -31,7 +33,7 @@ def after_steps(steps: int, far: int, near: int, seed: int = 0) -> tuple[DepthEr
         solid = parallax > 2.0
         sigma = NOISE_PX / parallax[solid]
         length, _ = error.length(learned[solid], 1.0 / nearness[solid], sigma)
-        error = error.with_step(learned, nearness, length)
+        error = error.with_step(learned, nearness, NOISE_PX / radius_px, length)
         lengths.append(length)
     return error, lengths
 
@@ -69,5 +71,25 @@ def test_moving_objects_in_a_tenth_of_the_corners_leave_the_bias_as_it_is() -> N
     for _ in range(60):
         depth = street(rng, 200, 200)
         factor = np.where(rng.random(400) < 0.1, 3.0, 1.0)
-        error = error.with_step(depth, factor / depth, 1.0)
+        error = error.with_step(depth, factor / depth, 0.0 * depth, 1.0)
     np.testing.assert_allclose(error.corrected(np.array([8.0, 60.0])), [8.0, 60.0], rtol=0.05)
+
+
+@pytest.mark.parametrize("noise_px", [0.1, 0.3])
+def test_short_steps_do_not_bias_far_depth_nor_widen_its_sigma(noise_px: float) -> None:
+    """Steps of half a metre past points of 4 to 200 m, whose learned depth scatters by 15 % around its own unit."""
+    rng, ahead, focal_px = np.random.default_rng(0), UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 360.0
+    error, length = DepthError(), 0.5
+    for _ in range(80):
+        depth = np.exp(rng.uniform(np.log(4.0), np.log(200.0), 600))
+        before = np.column_stack([rng.uniform(-0.8, 0.8, 600), rng.uniform(-0.25, 0.25, 600), np.ones(600)])
+        after = before * depth[:, None] + length * ahead.direction
+        after /= after[:, 2:]
+        after[:, :2] += rng.normal(0.0, noise_px / focal_px, (600, 2))
+        nearness, per_ray = triangulated_nearness(before, after, ahead)
+        learned = depth * np.exp(0.15 * rng.normal(size=600))
+        error = error.with_step(learned, nearness, noise_px / focal_px * per_ray, length)
+    far = np.array([10.0, 20.0, 40.0, 60.0, 80.0])
+    ratio = error.corrected(far) / far
+    np.testing.assert_allclose(ratio / ratio[0], 1.0, atol=0.02)
+    np.testing.assert_allclose(error.sigma(far), 0.15, atol=0.03)

@@ -18,7 +18,7 @@ T_PREVIOUS_CURRENT = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.ar
 def triangulated_motion() -> Motion:
     sigmas = pose_sigmas(T_PREVIOUS_CURRENT, ROTATION_SIGMAS, DIRECTION_SIGMAS, 0.05)
     pose = RelativePose(4, 5, T_PREVIOUS_CURRENT, sigmas, "essential")
-    return Motion(pose, DIRECTION_SIGMAS)
+    return Motion(pose, np.diag(np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]) ** 2))
 
 
 def motion_by_points() -> Motion:

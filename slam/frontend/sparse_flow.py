@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ Pixels = NDArray[np.float32]
 _LIMITS = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
 # least eigenvalue of a window's gradients: a tenth of what OpenCV wants, for plain walls
 _LEAST_TEXTURE = 1e-5
+_TILES = 3, 4
 
 
 def lucas_kanade(
@@ -78,8 +81,19 @@ def new_corners(
     free = _away_from(taken, int(spacing_px), grey.shape)
     if hidden is not None:
         free[resized_mask(hidden, *grey.shape[::-1])] = 0
-    found = cv2.goodFeaturesToTrack(grey, count, quality, spacing_px, mask=free, blockSize=block_px)
-    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+    found, rank = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.int64)]
+    for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
+        for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
+            at = slice(top, bottom), slice(left, right)
+            corners = cv2.goodFeaturesToTrack(
+                grey[at], count, quality, spacing_px, mask=np.ascontiguousarray(free[at]), blockSize=block_px
+            )
+            if corners is not None:
+                here = ((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1).sum()
+                found.append(corners.reshape(-1, 2) + np.float32([left, top]))
+                rank.append(here + np.arange(len(corners)))
+    order = np.argsort(np.concatenate(rank), kind="stable")[:count]
+    return np.concatenate(found)[order]
 
 
 def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:

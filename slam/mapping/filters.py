@@ -18,7 +18,9 @@ _OUTSIDE = -9.0  # a column left of every image
 _DARK_BLUE = 110  # grey levels below which nothing is the sky by day
 _MOST_SIGMA = 1e3  # relative, in place of infinity where depth is unknown
 _EXACT = 0.01  # relative sigma below which depth is not a network's: border, sky and edges are not in doubt
-FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agreement")
+_BEHIND = 1.2  # depth that an earlier view sees over that of a thing which was not there yet
+_PIECE = np.ones((5, 5), np.uint8)  # pixels of the least such thing: at edges, depth is blurred
+FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agreement", "moving")
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,16 @@ class DepthFilters:
         """The share of the pixels that each filter removed, over the pixels that reached it."""
         return dict(zip(FILTERS, (self._taken / max(self._frames, 1)).tolist(), strict=True))
 
-    def kept(self, view: KeyframeDepth, others: Sequence[KeyframeDepth]) -> DepthMap:
-        """The depth to fuse ``(H, W)``, 0 elsewhere; ``others`` see the same place from other positions."""
+    def kept(
+        self, view: KeyframeDepth, others: Sequence[KeyframeDepth], earlier: KeyframeDepth | None = None
+    ) -> DepthMap:
+        """The depth to fuse ``(H, W)``, 0 elsewhere.
+
+        Args:
+            view: to be fused.
+            others: the views beside it, which see the same place from other positions.
+            earlier: some time before: what it sees through has come there since.
+        """
         config, depth = self._config, view.depth
         everything = np.ones(depth.shape, dtype=bool)
         sigma = np.full_like(depth, np.nan) if view.relative_sigma is None else view.relative_sigma
@@ -75,6 +85,7 @@ class DepthFilters:
             everything if view.relative_sigma is None else sigma <= config.max_relative_sigma,
             ~_at_edges(self.trusted(view), config.max_depth_step) | is_exact,
             np.any([self._agrees(view, other) for other in others], axis=0) if others else everything,
+            everything if earlier is None else ~self._is_seen_through(view, earlier),
         )
         left = everything
         for number, mask in enumerate(masks):
@@ -123,6 +134,12 @@ class DepthFilters:
         u, v, z = self.projected(view, other)
         there = sampled(self.trusted(other), u, v)
         return np.asarray(np.abs(there - z) < np.float32(self._config.max_depth_difference) * z)
+
+    def _is_seen_through(self, view: KeyframeDepth, earlier: KeyframeDepth) -> Mask:
+        """Pixels ``(H, W)`` of pieces behind which the earlier view sees something."""
+        u, v, z = self.projected(view, earlier)
+        behind = sampled(self.trusted(earlier), u, v) > np.float32(_BEHIND) * z
+        return np.asarray(cv2.morphologyEx(behind.view(np.uint8), cv2.MORPH_OPEN, _PIECE), dtype=bool)
 
 
 def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:

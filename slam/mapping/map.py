@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from slam.runtime.run_files import SUBMAPS
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
+_EARLIER = 3  # views between one and that which tells what has come since
 _KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 
 
@@ -79,7 +81,7 @@ class TsdfMap:
         self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
         self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / SUBMAPS
         remove_submaps(self._folder)  # of a run that was killed here
-        self._previous: KeyframeDepth | None = None
+        self._before: deque[KeyframeDepth] = deque(maxlen=_EARLIER)
         self._waiting: KeyframeDepth | None = None
         self._stretch: _Stretch | None = None
         self._views_of_submaps: list[NDArray[np.int64]] = []
@@ -127,7 +129,7 @@ class TsdfMap:
             SlamError: a submap cannot be written, or the disk is full.
         """
         self._fuse_waiting(None)
-        if self._left_out and self._previous is None:
+        if self._left_out and not self._before:
             raise EmptyMapError(
                 f"the map is empty: none of {self._left_out} keyframes has depth that is certain to "
                 f"mapping.max_relative_sigma={self._config.max_relative_sigma:g}; more fuses what networks guess"
@@ -175,12 +177,12 @@ class TsdfMap:
         if self._waiting is None:
             return
         view, self._waiting = self._waiting, None
-        self._fuse(view, [other for other in (self._previous, following) if other is not None])
-        self._previous = view
+        self._fuse(view, [*list(self._before)[-1:], *([] if following is None else [following])])
+        self._before.append(view)
 
     def _fuse(self, view: KeyframeDepth, others: Sequence[KeyframeDepth]) -> None:
         """Filter and fuse a view, and begin a new submap where this one is long or large enough."""
-        kept = self._filters.kept(view, others)
+        kept = self._filters.kept(view, others, next(iter(self._before), None))
         config = self._config
         if self._stretch is None:
             limits = config.truncation_voxels, config.reach_m

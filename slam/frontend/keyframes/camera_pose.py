@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import Noise
@@ -46,6 +47,7 @@ def resect(
     intrinsics: Intrinsics,
     seed: int = 0,
     spread: FloatArray | None = None,
+    votes: NDArray[np.bool_] | None = None,
 ) -> CameraPose:
     """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
 
@@ -58,21 +60,26 @@ def resect(
         intrinsics: of the camera.
         seed: of RANSAC.
         spread: one sigma of each point ``(M, 3)``, in the direction in which it is uncertain; None for exact points.
+        votes: the points ``(M,)`` by which alone the pose is found; None for all.
     """
+    votes = np.ones(len(points), np.bool_) if votes is None else votes
 
     def support(pose: CameraPose) -> int:
-        return int((pose.residual_px < INLIER_PX).sum())
+        return int((pose.residual_px[votes] < INLIER_PX).sum())
 
-    best = _refined(guesses[0], points, spread, pixels, intrinsics)
+    def is_sure(pose: CameraPose) -> bool:
+        return support(pose) >= _DOUBTFUL_RATIO * votes.sum()
+
+    best = _refined(guesses[0], points, spread, pixels, intrinsics, votes)
     for guess in guesses[1:]:
-        if support(best) >= _DOUBTFUL_RATIO * len(points):
+        if is_sure(best):
             break
-        best = max(best, _refined(guess, points, spread, pixels, intrinsics), key=support)
-    if support(best) < _DOUBTFUL_RATIO * len(points):
-        found = consensus(points, pixels, intrinsics.K, _SAMPLES, INLIER_PX, seed)
+        best = max(best, _refined(guess, points, spread, pixels, intrinsics, votes), key=support)
+    if not is_sure(best):
+        found = consensus(points[votes], pixels[votes], intrinsics.K, _SAMPLES, INLIER_PX, seed)
         if found is not None:
             start = make(rotation_matrix(found[0]), found[1])
-            best = max(best, _refined(start, points, spread, pixels, intrinsics), key=support)
+            best = max(best, _refined(start, points, spread, pixels, intrinsics, votes), key=support)
     return best
 
 
@@ -82,6 +89,7 @@ def _refined(
     spread: FloatArray | None,
     pixels: FloatArray,
     intrinsics: Intrinsics,
+    votes: NDArray[np.bool_],
 ) -> CameraPose:
     """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
     T = T_camera_world.copy()
@@ -90,8 +98,8 @@ def _refined(
     residual, J, X = _whitened(T, points, spread, rays, focal)
     for _ in range(_ITERATIONS):
         norm = np.hypot(*residual)
-        scale = max(0.5 * INLIER_PX, median(norm))
-        weight = np.where(X[:, 2] > LEAST_DEPTH, 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
+        scale = max(0.5 * INLIER_PX, median(norm[votes]))
+        weight = np.where(votes & (X[:, 2] > LEAST_DEPTH), 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
         weighted = (weight * J).reshape(6, -1)
         information = weighted @ J.reshape(6, -1).T + 1e-9 * np.eye(6)
         step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
@@ -100,7 +108,7 @@ def _refined(
         if np.abs(step).max() < _CONVERGED:
             break
     in_front = X[:, 2] > LEAST_DEPTH
-    sigma = max(mad_sigma(residual), _LEAST_PIXEL_SIGMA)
+    sigma = max(mad_sigma(residual[:, votes]), _LEAST_PIXEL_SIGMA)
     sigmas = sigma * np.sqrt(np.diag(np.linalg.inv(information)))
     return CameraPose(T, np.where(in_front, np.hypot(*residual), np.inf), sigmas)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, nearest_depth, trusted_depth
@@ -60,6 +61,7 @@ _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
 _ROAD_TOLERANCE = 0.2  # largest deviation of a corner on the road from the camera's height, in camera heights
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
+_MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stands still, pixels
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
 _ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
@@ -70,7 +72,9 @@ _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degree
 class OdometryState:
     """State of visual odometry; ``last`` is the motion to the last frame, where one was measured.
 
-    Where corners alone gave its rotation and direction, ``points`` are those that it triangulated.
+    Where corners alone gave its rotation and direction, ``points`` are those that it triangulated. The tracks that
+    ``fitted`` ``(M,)`` the last motion that was measured have the vote on the next one: what passes between the camera
+    and the world never did, however many corners it has.
     """
 
     tracker: CornerTrackerState
@@ -80,6 +84,7 @@ class OdometryState:
     focal_length: FocalLength = field(default_factory=FocalLength)
     last: Motion | None = None
     points: TriangulatedPoints | None = None
+    fitted: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 class VisualOdometry:
@@ -137,11 +142,11 @@ class VisualOdometry:
         else:
             learned = nearest_depth(depth_previous_unscaled, tracks.previous)
             depth = trusted_depth(learned, height_unscaled)
-            ends = (previous.index, current.index)
+            ends, votes = (previous.index, current.index), self._votes(tracks)
             measured = (
-                self._still(ends, tracks, depth)
-                or self._by_essential((previous, current), tracks, learned, height_unscaled)
-                or self._by_points(ends, tracks, depth)
+                self._still(ends, tracks, votes, depth)
+                or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
+                or self._by_points(ends, tracks, votes, depth)
             )
         self._state = replace(self._state, last=measured if isinstance(measured, Motion) else None)
         return measured
@@ -184,7 +189,8 @@ class VisualOdometry:
             tracks = find()
             if len(tracks) < self._config.min_inliers:
                 return None
-            matches = self._matches(tracks, nearest_depth(depth_first_unscaled, tracks.previous), None, mask, error)
+            votes, learned = np.ones(len(tracks), dtype=bool), nearest_depth(depth_first_unscaled, tracks.previous)
+            matches = self._matches(tracks, votes, learned, None, mask, error)
             found = self._two_views.refined(matches, known[0])
             if found is None or found.inliers.sum() < self._config.min_inliers:
                 return None
@@ -203,20 +209,33 @@ class VisualOdometry:
         known = UnitRelativePose.of(last.relative_pose.T_from_to)
         return None if known is None else PredictedFlow(*known, depth_previous, self._intrinsics)
 
+    def _votes(self, tracks: Tracks) -> NDArray[np.bool_]:
+        """Which tracks ``(M,)`` have the vote: all, where few are left that fitted the last motion."""
+        fitted = np.isin(tracks.track_ids, self._state.fitted)
+        return fitted if fitted.sum() >= self._config.min_inliers else np.ones(len(tracks), dtype=bool)
+
     def _matches(
-        self, tracks: Tracks, learned: FloatArray, height: float | None, mask: DynamicMask, error: DepthError
+        self,
+        tracks: Tracks,
+        votes: NDArray[np.bool_],
+        learned: FloatArray,
+        height: float | None,
+        mask: DynamicMask,
+        error: DepthError,
     ) -> Matches:
         rays_previous, rays_current = self._intrinsics.rays(tracks.previous), self._intrinsics.rays(tracks.current)
         depth, sigma = error.corrected(learned), np.maximum(error.sigma(learned), DEPTH_RELATIVE_SIGMA)
         on_road = np.zeros(len(tracks), dtype=bool)
         if height is not None:
             on_road = np.abs(rays_previous[:, 1] * depth / height - 1.0) < _ROAD_TOLERANCE
-        return Matches(rays_previous, rays_current, depth, sigma, on_road, mask.weights(tracks.previous))
+        return Matches(rays_previous, rays_current, depth, sigma, on_road, mask.weights(tracks.previous), votes)
 
-    def _still(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | None:
-        flow = float(np.median(np.linalg.norm(tracks.current - tracks.previous, axis=1)))
+    def _still(self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray) -> Motion | None:
+        flows = np.linalg.norm(tracks.current - tracks.previous, axis=1)
+        flow = float(np.median(flows[votes]))
         if flow >= _STILL_FLOW_PX or not np.isfinite(depth).any():
             return None
+        self._state = replace(self._state, fitted=tracks.track_ids[flows < _MOST_STILL_FLOW_PX])
         # a forward step of t moves a point at depth z and r pixels from the centre by r t / z
         typical_radius_px = 0.25 * self._intrinsics.width
         translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
@@ -224,11 +243,16 @@ class VisualOdometry:
         return Motion(RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE), support=len(tracks) / tracks.sought)
 
     def _by_essential(
-        self, frames: tuple[Frame, Frame], tracks: Tracks, learned: FloatArray, height: float | None
+        self,
+        frames: tuple[Frame, Frame],
+        tracks: Tracks,
+        votes: NDArray[np.bool_],
+        learned: FloatArray,
+        height: float | None,
     ) -> Motion | MeasurementFailure | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        matches = self._matches(tracks, learned, height, self._state.dynamic_mask, self._state.depth_error)
-        rays_previous, rays_current = matches.rays_previous, matches.rays_current
+        matches = self._matches(tracks, votes, learned, height, self._state.dynamic_mask, self._state.depth_error)
+        rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
         # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._intrinsics)
@@ -273,6 +297,7 @@ class VisualOdometry:
             depth_error=state.depth_error.with_step(learned[still], nearness, sigma, step.motion.length_unscaled),
             focal_length=state.focal_length.with_step(*rays, two_view.unit_pose, self._intrinsics.fx),
             points=step.points,
+            fitted=tracks.track_ids[two_view.inliers],
         )
 
     def _triangulated(
@@ -314,9 +339,11 @@ class VisualOdometry:
         motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)
 
-    def _by_points(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | MeasurementFailure:
+    def _by_points(
+        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
+    ) -> Motion | MeasurementFailure:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
-        known = np.isfinite(depth)
+        known = np.isfinite(depth) & votes
         if known.sum() < self._config.min_inliers:
             return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
         corrected = self._state.depth_error.corrected(depth[known])
@@ -328,6 +355,7 @@ class VisualOdometry:
             known_corners = f"{count} of {len(pixels)} corners"
             return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
         resection = refine(points_previous, pixels, K, found)
+        self._state = replace(self._state, fitted=tracks.track_ids[known][found[2]])
         length = float(np.linalg.norm(resection.T_camera_points[:3, 3]))
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)

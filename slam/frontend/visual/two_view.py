@@ -60,7 +60,8 @@ class Matches:
     """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
 
     Learned depth is without its bias and has the relative ``depth_sigma`` ``(M,)``; by it the corners ``on_road``
-    ``(M,)`` lie at the height of the road. ``weights`` ``(M,)`` in (0, 1] are lower on dynamic objects.
+    ``(M,)`` lie at the height of the road. ``weights`` ``(M,)`` in (0, 1] are lower on dynamic objects. The motion that
+    most of those with ``votes`` ``(M,)`` agree on is chosen.
     """
 
     rays_previous: FloatArray
@@ -69,10 +70,12 @@ class Matches:
     depth_sigma: FloatArray
     on_road: NDArray[np.bool_]
     weights: FloatArray
+    votes: NDArray[np.bool_]
 
     def by_geometry_alone(self) -> Matches:
         """The same corners without what learned depth and the steps before say of them."""
-        return replace(self, depth_previous=np.full(len(self.weights), np.nan), weights=np.ones(len(self.weights)))
+        everyone = np.ones(len(self.weights))
+        return replace(self, depth_previous=np.nan * everyone, weights=everyone, votes=everyone > 0)
 
 
 @dataclass(frozen=True)
@@ -101,12 +104,13 @@ class TwoViewEstimator:
 
     def estimate(self, matches: Matches, history: MotionHistory) -> TwoViewEstimate | None:
         """Rotation and direction of the next motion; None without a consensus."""
-        reliable = matches.weights >= _LEAST_PROPOSING_WEIGHT
+        votes = matches.votes
+        reliable = votes & (matches.weights >= _LEAST_PROPOSING_WEIGHT)
         first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
         depth = matches.depth_previous[reliable]
         prior, least = history.prior(float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG))), _EARLY_EXIT_INLIER_RATIO
         usual = self._refined(matches, history.last, prior)
-        if usual is not None and usual.agreeing.mean() >= least:
+        if usual is not None and usual.agreeing[votes].mean() >= least:
             return usual
         tolerance = _RESECTION_PX / self._focal_px
         by_points = cache(lambda: unit_pose_by_pnp(first, second, depth, tolerance, self._seed))
@@ -115,12 +119,12 @@ class TwoViewEstimator:
             matches = self._with_first_sigma(matches, [proposed, by_points()])
         best = self._refined(matches, proposed, prior)
         candidates = [usual, best]
-        if best is None or best.agreeing.mean() < least:
+        if best is None or best.agreeing[votes].mean() < least:
             candidates.append(self._refined(matches, by_points(), prior))
         found = [candidate for candidate in candidates if candidate is not None]
         if not found:
             return None
-        return max(found, key=lambda candidate: _support(candidate, prior))
+        return max(found, key=lambda candidate: _support(candidate, votes, prior))
 
     def refined(self, matches: Matches, start: UnitRelativePose) -> TwoViewEstimate | None:
         """The motion refined from a well-known ``start``.
@@ -243,11 +247,11 @@ class TwoViewEstimator:
         return np.asarray(matches.depth_previous[usable] / depth[usable]), np.asarray(shift_px[usable])
 
 
-def _support(candidate: TwoViewEstimate, prior: MotionPrior) -> float:
-    """Number of inliers that agree with learned depth, less the cost of leaving the usual axis.
+def _support(candidate: TwoViewEstimate, votes: NDArray[np.bool_], prior: MotionPrior) -> float:
+    """Number of votes of inliers that agree with learned depth, less the cost of leaving the usual axis.
 
     Forwards and backwards are equal.
     """
     cosine = abs(float(prior.axis @ candidate.unit_pose.direction))
     deviation = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
-    return float(candidate.agreeing.sum()) - 0.5 * deviation**2 / _OUTLIER_COST
+    return float(candidate.agreeing[votes].sum()) - 0.5 * deviation**2 / _OUTLIER_COST

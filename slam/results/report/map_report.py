@@ -27,6 +27,7 @@ _FILTERS = {
     "sigma": "refined depth too uncertain (mapping.max_relative_sigma)",
     "edge": "at a step of depth (mapping.max_depth_step)",
     "agreement": "the keyframe before does not agree (mapping.max_depth_difference)",
+    "moving": "a keyframe before saw what is behind",
 }
 _TRUTHS = {
     "exact surface": "the exact surface of the simulated world",

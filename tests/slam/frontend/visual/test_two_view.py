@@ -35,7 +35,7 @@ def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int =
 def matches_of(previous: np.ndarray, current: np.ndarray, learned: np.ndarray) -> Matches:
     count = len(learned)
     sigma = np.full(count, DEPTH_RELATIVE_SIGMA)
-    return Matches(previous, current, learned, sigma, np.zeros(count, bool), np.ones(count))
+    return Matches(previous, current, learned, sigma, np.zeros(count, bool), np.ones(count), np.ones(count, bool))
 
 
 def corner_with_a_car(seed: int, turn_deg: float = 4.0, error: float = 0.15) -> tuple[Matches, np.ndarray]:

@@ -24,6 +24,7 @@ _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 # points whose sightings are eliminated together: they share few cameras
 _BLOCK = 512
+_ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,13 @@ class BundleAdjustment:
         self._log_depth = np.log(sightings.depth)
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
+        times = np.bincount(sightings.point, self._learned)[sightings.point] if len(sightings) else np.ones(0)
+        self._depth_sigma = noise.depth * np.sqrt(np.maximum(times, 1.0))
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
         self._rows = [np.flatnonzero(sightings.camera == camera) for camera in range(len(free))]
+        self._learned_rows = [rows[self._learned[rows]] for rows in self._rows]
         self._blocks = self._eliminated_together()
 
     def solve(
@@ -127,15 +131,29 @@ class BundleAdjustment:
         z = np.maximum(X[:, 2:], _LEAST_DEPTH)
         found = np.empty((len(X), 3))
         found[:, :2] = (X[:, :2] / z - self._rays) * self._focal / self._noise.pixel
-        found[:, 2] = self._learned * (np.log(z[:, 0]) - self._log_depth) / self._noise.depth
+        found[:, 2] = self._relief(np.log(z[:, 0]) - self._log_depth)
         return found
+
+    def _relief(self, logarithms: FloatArray) -> FloatArray:
+        """Residuals of depth ``(S,)`` without what those of an image have in common, Huber's location."""
+        whitened = np.zeros(len(logarithms))
+        for rows in self._learned_rows:
+            if len(rows):
+                own, sigma = logarithms[rows], self._depth_sigma[rows]
+                unit = float(np.median(own))
+                for _ in range(_ROUNDS):
+                    off = np.abs(own - unit) / sigma
+                    weight = np.minimum(1.0, self._noise.huber / np.maximum(off, 1e-9)) / sigma**2
+                    unit = float((weight * own).sum() / weight.sum())
+                whitened[rows] = (own - unit) / sigma
+        return whitened
 
     def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the residuals by their camera's perturbation ``(6, 3, S)`` and their point ``(3, 3, S)``."""
         X = self._in_cameras(T_camera_world, points)
         by_camera = np.zeros((6, 3, len(X)))
         by_camera[:, :2] = pixel_jacobian(X, self._focal / self._noise.pixel)
-        scale = self._learned / (self._noise.depth * np.maximum(X[:, 2], _LEAST_DEPTH))
+        scale = self._learned / (self._depth_sigma * np.maximum(X[:, 2], _LEAST_DEPTH))
         by_camera[0, 2], by_camera[1, 2], by_camera[5, 2] = X[:, 1] * scale, -X[:, 0] * scale, scale
         by_point = np.empty((3, 3, len(X)))
         for T, rows in zip(T_camera_world, self._rows, strict=True):

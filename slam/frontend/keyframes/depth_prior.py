@@ -14,10 +14,8 @@ from slam.geometry.se3 import FloatArray, invert
 
 DEPTH_SIGMA = 0.3  # of the logarithm of learned depth
 HUBER = 1.5  # sigmas beyond which residuals of an adjustment weigh less
-_ROUNDS = 10
 _SETTLED = np.deg2rad(1.0)  # angle between rays from which on they know a depth better
 _LEAST_POINTS = 20
-_RETURN = 0.9  # exponent of a unit that no point with parallax holds: it returns to that of learned depth
 
 
 class Parallax:
@@ -58,28 +56,17 @@ class Parallax:
         return np.asarray(sigma[:, None] * (self._points - self.centre))
 
 
-def unit_for_new(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
+def unit_for_new(ratios: FloatArray, angle: FloatArray, pixel_angle: float) -> float:
     """The unit of a map per learned depth of an image, for new points of this image.
 
     Args:
         ratios: of the depth of known points in the map over their learned depth ``(M,)``, positive.
-        settled: which of these points have parallax ``(M,)``.
+        angle: parallax of these points ``(M,)``, radians.
+        pixel_angle: that rays are known to, radians.
     """
-    if settled.sum() >= _LEAST_POINTS:
-        return float(np.median(ratios[settled]))
-    return float(np.median(ratios)) ** _RETURN if len(ratios) >= _LEAST_POINTS else 1.0
-
-
-def unit_for_loose(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
-    """The same for its points without parallax: their own unit, so that together they do not pull at the map.
-
-    It is Huber's location of the logarithms, where the pulls of the adjustment cancel.
-    """
-    logarithms = np.log(ratios[~settled])
-    if not len(logarithms):
+    if len(ratios) < _LEAST_POINTS:
         return 1.0
-    unit = float(np.median(logarithms))
-    for _ in range(_ROUNDS):
-        weight = np.minimum(1.0, HUBER * DEPTH_SIGMA / np.maximum(np.abs(logarithms - unit), 1e-9))
-        unit = float((weight * logarithms).sum() / weight.sum())
-    return float(np.exp(unit if settled.sum() >= _LEAST_POINTS else _RETURN * unit))
+    order = np.argsort(ratios)
+    weight = 1.0 / (DEPTH_SIGMA**2 + (pixel_angle / np.maximum(angle[order], 1e-6)) ** 2)
+    total = np.cumsum(weight)
+    return float(ratios[order[np.searchsorted(total, 0.5 * total[-1])]])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
-from slam.frontend.keyframes.depth_prior import Parallax, unit_for_loose, unit_for_new
+from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
 from slam.frontend.keyframes.descriptors import Descriptors
 from slam.frontend.keyframes.flow import flow
 from slam.frontend.sparse_flow import Pixels
@@ -128,7 +128,7 @@ class LocalMap:
         tracks, learned = newest.track_ids, newest.learned_depth
         ratios = self.ratios(newest)
         both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
-        unit = unit_for_new(ratios[both], self.parallax(_LOOKED_BACK).settled[tracks[both]])
+        unit = unit_for_new(ratios[both], self.parallax(_LOOKED_BACK).angle[tracks[both]], Noise().pixel / intrinsics.fx)
         rays = intrinsics.rays(newest.pixels[new]) * (unit * learned[new, None])
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
 
@@ -191,7 +191,6 @@ class LocalMap:
     def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
         keyframes = [self.keyframes[k] for k in chosen]
-        settled = self._parallax(keyframes).settled
         known = [seen[keyframe.track_ids] for keyframe in keyframes]
         camera = np.repeat(np.arange(len(chosen)), [rows.sum() for rows in known])
 
@@ -200,17 +199,10 @@ class LocalMap:
 
         track = joined(keyframe.track_ids for keyframe in keyframes)
         pixel = joined(keyframe.pixels for keyframe in keyframes)
-        depth = joined(self._prior(keyframe, settled) for keyframe in keyframes)
+        depth = joined(np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan) for keyframe in keyframes)
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
         return Sightings(camera[twice], row_of, pixel[twice], depth[twice]), points
-
-    def _prior(self, keyframe: TrackedKeyframe, settled: NDArray[np.bool_]) -> FloatArray:
-        """Learned depth of a keyframe's corners ``(M,)`` in the unit of the map; NaN where they have parallax."""
-        ratios, is_settled = self.ratios(keyframe), settled[keyframe.track_ids]
-        both = ratios > 0.0
-        unit = unit_for_loose(ratios[both], is_settled[both])
-        return np.where(both & ~is_settled, unit * keyframe.learned_depth, np.nan)
 
     def ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
         """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""

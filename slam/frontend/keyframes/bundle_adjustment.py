@@ -31,13 +31,15 @@ _ROUNDS = 5
 class Sightings:
     """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth`` ``(S,)``.
 
-    Depth is that in the camera by its prior, NaN for none. A point is seen at most once by a camera.
+    Depth is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm ``(S,)``;
+    NaN for none. A point is seen at most once by a camera.
     """
 
     camera: NDArray[np.int64]
     point: NDArray[np.int64]
     pixels: FloatArray
     depth: FloatArray
+    depth_sigma: FloatArray
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -88,7 +90,7 @@ class BundleAdjustment:
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
         times = np.bincount(sightings.point, self._learned)[sightings.point] if len(sightings) else np.ones(0)
-        self._depth_sigma = noise.depth * np.sqrt(np.maximum(times, 1.0))
+        self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times, 1.0))
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0

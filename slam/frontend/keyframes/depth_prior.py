@@ -70,3 +70,12 @@ def unit_for_new(ratios: FloatArray, angle: FloatArray, pixel_angle: float) -> f
     weight = 1.0 / (DEPTH_SIGMA**2 + (pixel_angle / np.maximum(angle[order], 1e-6)) ** 2)
     total = np.cumsum(weight)
     return float(ratios[order[np.searchsorted(total, 0.5 * total[-1])]])
+
+
+def prior_sigma(angle: FloatArray, pixel_angle: float) -> FloatArray:
+    """Sigmas of learned depth as a prior ``(M,)``, of its logarithm, by the parallax of points ``(M,)``."""
+    by_rays = pixel_angle / np.maximum(angle, 1e-6)
+    return DEPTH_SIGMA * (1.0 + (DEPTH_SIGMA / by_rays) ** POWER)
+
+
+POWER = 2

@@ -149,7 +149,7 @@ def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
     """Adjust all keyframes but the first, in rounds between which outliers are taken out."""
     everything = range(len(local.keyframes))
     for limit in _OUTLIER_LIMITS:
-        sightings, track_ids = local.sightings(everything, np.isfinite(local.points[:, 0]))
+        sightings, track_ids = local.sightings(everything, np.isfinite(local.points[:, 0]), intrinsics)
         gone, _ = local.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
         outliers = sum(map(len, gone))
         logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA, HUBER
+from slam.frontend.keyframes.depth_prior import HUBER
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.projection import pixel_jacobian
@@ -24,7 +24,7 @@ _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 # points whose sightings are eliminated together: they share few cameras
 _BLOCK = 512
-_ROUNDS = 5
+_ROUNDS = 5  # of Huber's location
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,10 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Noise:
-    """Sigmas of a tracked corner's coordinate, pixels, and of the logarithm of depth by its prior.
-
-    Residuals beyond ``huber`` sigmas weigh less.
-    """
+    """Sigma of a tracked corner's coordinate, pixels; residuals beyond ``huber`` sigmas weigh less."""
 
     pixel: float = 0.7
     huber: float = HUBER
-    depth: float = DEPTH_SIGMA
 
 
 @dataclass(frozen=True)
@@ -89,8 +85,9 @@ class BundleAdjustment:
         self._log_depth = np.log(sightings.depth)
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
-        times = np.bincount(sightings.point, self._learned)[sightings.point] if len(sightings) else np.ones(0)
-        self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times, 1.0))
+        # images of one point share the network's error
+        times = np.bincount(sightings.point[self._learned], minlength=int(sightings.point.max(initial=-1)) + 1)
+        self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times[sightings.point], 1))
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
@@ -137,15 +134,19 @@ class BundleAdjustment:
         return found
 
     def _relief(self, logarithms: FloatArray) -> FloatArray:
-        """Residuals of depth ``(S,)`` without what those of an image have in common, Huber's location."""
+        """Residuals of depth ``(S,)`` without what those of an image have in common, which is Huber's location.
+
+        It is where an adjustment of the images' units would end, so that derivatives need not know it.
+        """
         whitened = np.zeros(len(logarithms))
         for rows in self._learned_rows:
             if len(rows):
                 own, sigma = logarithms[rows], self._depth_sigma[rows]
                 unit = float(np.median(own))
                 for _ in range(_ROUNDS):
-                    off = np.abs(own - unit) / sigma
-                    weight = np.minimum(1.0, self._noise.huber / np.maximum(off, 1e-9)) / sigma**2
+                    weight = (
+                        np.minimum(1.0, self._noise.huber * sigma / np.maximum(np.abs(own - unit), 1e-9)) / sigma**2
+                    )
                     unit = float((weight * own).sum() / weight.sum())
                 whitened[rows] = (own - unit) / sigma
         return whitened

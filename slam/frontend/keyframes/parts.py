@@ -6,6 +6,7 @@ may be a tenth off, and every point fits. So it is cut there, and each part has 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -46,6 +47,7 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     segment = _held(segment, np.minimum(sigmas, np.where(tied, _TURNED, _UNKNOWN)))
     local, keyframes = segment.map, segment.map.keyframes
     number = np.concatenate([[0], np.cumsum(~(_carries(sigmas) & tied))])
+    pace = _pace([pair for pair, is_tied in zip(pairwise(keyframes), tied, strict=True) if is_tied])
     runs = [rows for n in range(number[-1] + 1) if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES]
     if not runs:
         return [segment]
@@ -57,14 +59,14 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     for k in range(1, len(keyframes)):
         if part[k] < 0 or part[k] != part[k - 1]:
             to_next = keyframes[k].index, keyframes[k].T_camera_world
-            parts[before[k - 1]].turns.append(_turn(local, keyframes[k - 1], *to_next, bool(tied[k - 1])))
+            parts[before[k - 1]].turns.append(_turn(keyframes[k - 1], *to_next, None if tied[k - 1] else pace))
     starts = np.array([keyframe.index for keyframe in keyframes])
     for frame in segment.frames:
         k = int(np.searchsorted(starts, frame.index, side="right")) - 1
         if part[k] >= 0:
             parts[part[k]].frames.append(frame)
         elif frame.T_camera_world is not None and frame.index != starts[k]:
-            parts[before[k]].turns.append(_turn(local, keyframes[k], frame.index, frame.T_camera_world, True))
+            parts[before[k]].turns.append(_turn(keyframes[k], frame.index, frame.T_camera_world))
     for each in parts:
         each.turns.sort(key=lambda turn: turn.to_index)
     return parts
@@ -83,21 +85,26 @@ def _held(segment: MapSegment, carried: FloatArray) -> MapSegment:
     return held
 
 
-def _turn(
-    local: LocalMap, keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, is_tied: bool
-) -> RelativePose:
+def _pace(pairs: Sequence[tuple[TrackedKeyframe, TrackedKeyframe]]) -> float:
+    """The median way of the camera from frame to frame between keyframes; 0 without any."""
+    steps = [(a.T_camera_world @ invert(b.T_camera_world), b.index - a.index) for a, b in pairs]
+    return float(np.median([np.linalg.norm(T[:3, 3]) / frames for T, frames in steps])) if steps else 0.0
+
+
+def _turn(keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, pace: float | None = None) -> RelativePose:
     """From a keyframe to a later camera in the unit of learned depth.
 
-    By the whole image, it is a turn of unknown small length, whatever later adjustments made of it.
+    Where no points lead there, but the whole image, it is a turn of unknown small length, whatever later adjustments
+    made of it: at most some way at the camera's ``pace`` by frame.
     """
     T = keyframe.T_camera_world @ invert(T_camera_world)
     learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
     depth = float(np.median(learned)) if len(learned) else 1.0
-    if is_tied:
+    if pace is None:
         sigmas = _ROTATION, _LENGTH * depth + _DEPTH_SIGMA * float(np.linalg.norm(T[:3, 3]))
     else:
         T[:3, 3] = 0.0
-        sigmas = _IMAGE_ROTATION, _IMAGE_LENGTH * depth
+        sigmas = _IMAGE_ROTATION, _IMAGE_LENGTH * depth + pace * (index - keyframe.index)
     return RelativePose(keyframe.index, index, T, np.repeat(sigmas, 3), KEYFRAME_SOURCE)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-
 from scipy.linalg import solveh_banded
 
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe

@@ -193,7 +193,7 @@ def _tracking(result: Estimate) -> TrackingMetrics | Missing:
         return Missing("this drive has no map of keyframes: it is measured from step to step")
     return TrackingMetrics(
         keyframes=sum(len(segment.map.keyframes) for segment in drive.maps),
-        maps=len(set(drive.map_poses.segments.values())),
+        maps=len(set(drive.map_poses.linked.values())),
         located_frames=len(drive.map_poses.segments),
         events=[Event(**asdict(event)) for event in drive.events],
     )

@@ -200,7 +200,7 @@ class Event(Record):
 
 
 class TrackingMetrics(Record):
-    """Keyframes and their maps, and the number of frames that have a pose in one."""
+    """Keyframes, maps that neither turns nor loops join, and the number of frames that have a pose in one."""
 
     keyframes: Known[Count] = MISSING
     maps: Known[Count] = MISSING

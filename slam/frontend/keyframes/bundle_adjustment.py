@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA, HUBER
+from slam.frontend.keyframes.depth_prior import HUBER
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.projection import pixel_jacobian
@@ -24,19 +24,22 @@ _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 # points whose sightings are eliminated together: they share few cameras
 _BLOCK = 512
+_ROUNDS = 5  # of Huber's location
 
 
 @dataclass(frozen=True)
 class Sightings:
     """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth`` ``(S,)``.
 
-    Depth is that in the camera by its prior, NaN for none. A point is seen at most once by a camera.
+    Depth is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm ``(S,)``;
+    NaN for none. A point is seen at most once by a camera.
     """
 
     camera: NDArray[np.int64]
     point: NDArray[np.int64]
     pixels: FloatArray
     depth: FloatArray
+    depth_sigma: FloatArray
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -44,14 +47,10 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Noise:
-    """Sigmas of a tracked corner's coordinate, pixels, and of the logarithm of depth by its prior.
-
-    Residuals beyond ``huber`` sigmas weigh less.
-    """
+    """Sigma of a tracked corner's coordinate, pixels; residuals beyond ``huber`` sigmas weigh less."""
 
     pixel: float = 0.7
     huber: float = HUBER
-    depth: float = DEPTH_SIGMA
 
 
 @dataclass(frozen=True)
@@ -86,10 +85,14 @@ class BundleAdjustment:
         self._log_depth = np.log(sightings.depth)
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
+        # images of one point share the network's error
+        times = np.bincount(sightings.point[self._learned], minlength=int(sightings.point.max(initial=-1)) + 1)
+        self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times[sightings.point], 1))
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
         self._rows = [np.flatnonzero(sightings.camera == camera) for camera in range(len(free))]
+        self._learned_rows = [rows[self._learned[rows]] for rows in self._rows]
         self._blocks = self._eliminated_together()
 
     def solve(
@@ -127,15 +130,33 @@ class BundleAdjustment:
         z = np.maximum(X[:, 2:], _LEAST_DEPTH)
         found = np.empty((len(X), 3))
         found[:, :2] = (X[:, :2] / z - self._rays) * self._focal / self._noise.pixel
-        found[:, 2] = self._learned * (np.log(z[:, 0]) - self._log_depth) / self._noise.depth
+        found[:, 2] = self._relief(np.log(z[:, 0]) - self._log_depth)
         return found
+
+    def _relief(self, logarithms: FloatArray) -> FloatArray:
+        """Residuals of depth ``(S,)`` without what those of an image have in common, which is Huber's location.
+
+        It is where an adjustment of the images' units would end, so that derivatives need not know it.
+        """
+        whitened = np.zeros(len(logarithms))
+        for rows in self._learned_rows:
+            if len(rows):
+                own, sigma = logarithms[rows], self._depth_sigma[rows]
+                unit = float(np.median(own))
+                for _ in range(_ROUNDS):
+                    weight = (
+                        np.minimum(1.0, self._noise.huber * sigma / np.maximum(np.abs(own - unit), 1e-9)) / sigma**2
+                    )
+                    unit = float((weight * own).sum() / weight.sum())
+                whitened[rows] = (own - unit) / sigma
+        return whitened
 
     def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the residuals by their camera's perturbation ``(6, 3, S)`` and their point ``(3, 3, S)``."""
         X = self._in_cameras(T_camera_world, points)
         by_camera = np.zeros((6, 3, len(X)))
         by_camera[:, :2] = pixel_jacobian(X, self._focal / self._noise.pixel)
-        scale = self._learned / (self._noise.depth * np.maximum(X[:, 2], _LEAST_DEPTH))
+        scale = self._learned / (self._depth_sigma * np.maximum(X[:, 2], _LEAST_DEPTH))
         by_camera[0, 2], by_camera[1, 2], by_camera[5, 2] = X[:, 1] * scale, -X[:, 0] * scale, scale
         by_point = np.empty((3, 3, len(X)))
         for T, rows in zip(T_camera_world, self._rows, strict=True):

@@ -1,8 +1,8 @@
-"""Learned depth as a prior of points, until their rays have parallax.
+"""Learned depth as a prior of points: what depths of an image are to each other, nothing about the unit of the map.
 
-Depths of one image fit each other much better than the depths of two images: they share an unknown unit. So each image
-has its own (as depth maps are aligned before they are fused), and it weighs only where no point with parallax knows the
-unit of the map.
+Depths of one image fit each other much better than the depths of two images: they share an unknown unit. So an
+adjustment leaves out what the depths of an image have in common. What remains is still no independent error of each
+point, so that it weighs less where rays know a depth as well.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from slam.geometry.se3 import FloatArray, invert
 
 DEPTH_SIGMA = 0.3  # of the logarithm of learned depth
 HUBER = 1.5  # sigmas beyond which residuals of an adjustment weigh less
-_ROUNDS = 10
-_SETTLED = np.deg2rad(1.0)  # angle between rays from which on they know a depth better
+_SETTLED = np.deg2rad(1.0)  # angle between rays of a point with parallax
 _LEAST_POINTS = 20
-_RETURN = 0.9  # exponent of a unit that no point with parallax holds: it returns to that of learned depth
 
 
 class Parallax:
@@ -52,34 +50,29 @@ class Parallax:
         """Which points have parallax ``(N,)``."""
         return np.asarray(self._cosine < np.cos(_SETTLED))
 
+    def by_rays(self, pixel_angle: float) -> FloatArray:
+        """Sigmas of the logarithm of depth ``(N,)`` by rays that are known to ``pixel_angle`` radians."""
+        return np.asarray(pixel_angle / np.maximum(self.angle, 1e-9))
+
+    def prior_sigma(self, pixel_angle: float) -> FloatArray:
+        """The same by learned depth ``(N,)``: errors that points share do not pull at what rays know."""
+        return np.asarray(DEPTH_SIGMA * (1.0 + (DEPTH_SIGMA / self.by_rays(pixel_angle)) ** 2))
+
     def spread(self, pixel_angle: float) -> FloatArray:
         """One sigma of each point along its first ray ``(N, 3)``, if rays are known to ``pixel_angle`` radians."""
-        sigma = np.minimum(pixel_angle / np.maximum(self.angle, 1e-9), DEPTH_SIGMA)
+        sigma = np.minimum(self.by_rays(pixel_angle), DEPTH_SIGMA)
         return np.asarray(sigma[:, None] * (self._points - self.centre))
 
 
-def unit_for_new(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
-    """The unit of a map per learned depth of an image, for new points of this image.
+def unit_for_new(ratios: FloatArray, by_rays: FloatArray) -> float:
+    """The unit of a map per learned depth of an image, for new points of this image: the weighted median.
 
     Args:
         ratios: of the depth of known points in the map over their learned depth ``(M,)``, positive.
-        settled: which of these points have parallax ``(M,)``.
+        by_rays: sigmas of the logarithms of the depths in the map ``(M,)``.
     """
-    if settled.sum() >= _LEAST_POINTS:
-        return float(np.median(ratios[settled]))
-    return float(np.median(ratios)) ** _RETURN if len(ratios) >= _LEAST_POINTS else 1.0
-
-
-def unit_for_loose(ratios: FloatArray, settled: NDArray[np.bool_]) -> float:
-    """The same for its points without parallax: their own unit, so that together they do not pull at the map.
-
-    It is Huber's location of the logarithms, where the pulls of the adjustment cancel.
-    """
-    logarithms = np.log(ratios[~settled])
-    if not len(logarithms):
+    if len(ratios) < _LEAST_POINTS:
         return 1.0
-    unit = float(np.median(logarithms))
-    for _ in range(_ROUNDS):
-        weight = np.minimum(1.0, HUBER * DEPTH_SIGMA / np.maximum(np.abs(logarithms - unit), 1e-9))
-        unit = float((weight * logarithms).sum() / weight.sum())
-    return float(np.exp(unit if settled.sum() >= _LEAST_POINTS else _RETURN * unit))
+    order = np.argsort(ratios)
+    weight = np.cumsum(1.0 / (DEPTH_SIGMA**2 + by_rays[order] ** 2))
+    return float(ratios[order[np.searchsorted(weight, 0.5 * weight[-1])]])

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
+from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA
 from slam.frontend.visual.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
 from slam.geometry.se3 import FloatArray, make
 
@@ -57,6 +58,7 @@ def first_motion(
         np.tile(rows, 2),
         np.concatenate([pixels_before, pixels]),
         np.concatenate([depth, np.full(len(rows), np.nan)]),
+        np.full(2 * len(rows), DEPTH_SIGMA),
     )
     problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]), Noise())
     solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_LIMITS) for T, z in starts]

@@ -50,7 +50,7 @@ def join(
     Returns:
         The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
     """
-    united = _united([_moved(*part) for part in _parts(segments, T_world_camera, scales)])
+    united = _united([moved(*part) for part in _parts(segments, T_world_camera, scales)])
     keyframes = united.map.keyframes
     tracks = _merged_tracks(keyframes, len(united.map.points), shared)
     joined = _renumbered(united, tracks)
@@ -68,7 +68,7 @@ def _parts(
     ]
 
 
-def _moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -> MapSegment:
+def moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -> MapSegment:
     """A map by new poses ``(K, 4, 4)`` and units ``(K,)`` of its keyframes.
 
     Points follow the first keyframe that sees them, frames the last keyframe before them.
@@ -149,7 +149,7 @@ def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
     """Adjust all keyframes but the first, in rounds between which outliers are taken out."""
     everything = range(len(local.keyframes))
     for limit in _OUTLIER_LIMITS:
-        sightings, track_ids = local.sightings(everything, np.isfinite(local.points[:, 0]))
+        sightings, track_ids = local.sightings(everything, np.isfinite(local.points[:, 0]), intrinsics)
         gone, _ = local.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
         outliers = sum(map(len, gone))
         logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)

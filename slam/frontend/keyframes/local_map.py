@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
-from slam.frontend.keyframes.depth_prior import Parallax, unit_for_loose, unit_for_new
+from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
 from slam.frontend.keyframes.descriptors import Descriptors
 from slam.frontend.keyframes.flow import flow
 from slam.frontend.sparse_flow import Pixels
@@ -128,7 +128,8 @@ class LocalMap:
         tracks, learned = newest.track_ids, newest.learned_depth
         ratios = self.ratios(newest)
         both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
-        unit = unit_for_new(ratios[both], self.parallax(_LOOKED_BACK).settled[tracks[both]])
+        by_rays = self.parallax(_LOOKED_BACK).by_rays(Noise().pixel / intrinsics.fx)
+        unit = unit_for_new(ratios[both], by_rays[tracks[both]])
         rays = intrinsics.rays(newest.pixels[new]) * (unit * learned[new, None])
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
 
@@ -149,7 +150,7 @@ class LocalMap:
         seen &= np.isfinite(self.points[:, 0])
         fixed = self._sharing(seen, first)
         chosen = [*fixed, *range(first, len(self.keyframes))]
-        sightings, track_ids = self.sightings(chosen, seen)
+        sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
         gone, dead = self.solve(chosen, max(len(fixed), 1 + (first > 0)), sightings, track_ids, intrinsics, limits)
         return np.concatenate([dead, gone[-1]])
@@ -188,10 +189,11 @@ class LocalMap:
         best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
         return sorted(k for _, k in best)
 
-    def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
+    def sightings(
+        self, chosen: Sequence[int], seen: NDArray[np.bool_], intrinsics: Intrinsics
+    ) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
         keyframes = [self.keyframes[k] for k in chosen]
-        settled = self._parallax(keyframes).settled
         known = [seen[keyframe.track_ids] for keyframe in keyframes]
         camera = np.repeat(np.arange(len(chosen)), [rows.sum() for rows in known])
 
@@ -200,17 +202,11 @@ class LocalMap:
 
         track = joined(keyframe.track_ids for keyframe in keyframes)
         pixel = joined(keyframe.pixels for keyframe in keyframes)
-        depth = joined(self._prior(keyframe, settled) for keyframe in keyframes)
+        depth = joined(np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan) for keyframe in keyframes)
+        sigma = self._parallax(keyframes).prior_sigma(Noise().pixel / intrinsics.fx)[track]
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
-        return Sightings(camera[twice], row_of, pixel[twice], depth[twice]), points
-
-    def _prior(self, keyframe: TrackedKeyframe, settled: NDArray[np.bool_]) -> FloatArray:
-        """Learned depth of a keyframe's corners ``(M,)`` in the unit of the map; NaN where they have parallax."""
-        ratios, is_settled = self.ratios(keyframe), settled[keyframe.track_ids]
-        both = ratios > 0.0
-        unit = unit_for_loose(ratios[both], is_settled[both])
-        return np.where(both & ~is_settled, unit * keyframe.learned_depth, np.nan)
+        return Sightings(camera[twice], row_of, pixel[twice], depth[twice], sigma[twice]), points
 
     def ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
         """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""

@@ -37,8 +37,8 @@ class KeyframePoses:
     learned_units: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property
-    def _linked(self) -> Mapping[int, int]:
-        """The first of the maps that turns link with the map of each frame."""
+    def linked(self) -> Mapping[int, int]:
+        """The first of the maps that turns link with the map of each frame, by frame."""
         first = {number: number for number in self.segments.values()}
         for pose in self.poses:
             one, other = (first.get(self.segments.get(frame, -1)) for frame in pose.ends)
@@ -48,13 +48,13 @@ class KeyframePoses:
 
     def is_inside(self, pose: RelativePose) -> bool:
         """Whether both frames of a measurement have poses in one map, or in maps that turns link."""
-        first, last = (self._linked.get(frame) for frame in pose.ends)
+        first, last = (self.linked.get(frame) for frame in pose.ends)
         return first is not None and first == last
 
     @property
     def steps(self) -> set[Ends]:
         """Neighbouring frames that both have poses in one map, or in maps that turns link."""
-        return {(k, k + 1) for k, number in self._linked.items() if self._linked.get(k + 1) == number}
+        return {(k, k + 1) for k, number in self.linked.items() if self.linked.get(k + 1) == number}
 
     def relates(self, first: int) -> bool:
         """Whether the frames before ``first`` and the frames from it on have poses in one map."""

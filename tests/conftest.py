@@ -116,7 +116,7 @@ _FILES = (
     *("config.yaml", "metrics.json", "graph.g2o", "loops.json", "places.npz", "drive.zip"),
     *("report.html", "run.log"),
 )
-_MAP_FILES = ("map_mesh.ply", "map_cloud.ply", "map_above.png", "map_driver.png")
+_MAP_FILES = ("map_mesh.ply", "map_cloud.ply")
 
 
 def _violations(node: Any, wanted: Any, where: str) -> list[str]:

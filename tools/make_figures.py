@@ -11,22 +11,23 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from shared.command import one_line_errors, parser_of
+from shared.pictures import STYLE, cast, draw_trajectories, trajectories_of
 
 from erfsfm.inference import DepthPosePredictor, colour_disparity
 from slam.frames import Sequence
 from slam.results.folder import RunFolder
-from slam.results.report.map_mesh import MapMeshFile
-from slam.results.report.map_view import MapScene
-from slam.results.report.plots import draw_trajectories, figure_style, map_figure, trajectories_of
+from slam.results.report.map_mesh import MapMesh, MapMeshFile
 from slam.runtime.run_files import MAP_MESH
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600
-NEAR_M = 100.0
+SEAT_PX = 1280, 720
+MOST_TRIANGLES = 4_000_000
 
 
 @one_line_errors()
@@ -56,10 +57,11 @@ def main() -> None:
 
 
 def seat(folder: RunFolder, sequence: Sequence, frame: int) -> NDArray[np.uint8]:
-    """A frame above what its camera sees of the map within 100 m."""
+    """A frame above what a camera at its place sees of the map."""
     T_world_camera = trajectories_of(folder)["optimised"].T_world_camera[frame]
-    mesh = MapMeshFile(folder.require(MAP_MESH)).near(T_world_camera[:3, 3], NEAR_M)
-    below = MapScene(mesh).from_seat(T_world_camera)
+    u, v = np.meshgrid(np.arange(SEAT_PX[0]) - 0.5 * SEAT_PX[0], np.arange(SEAT_PX[1]) - 0.5 * SEAT_PX[1])
+    rays = np.stack([u, v, np.full_like(u, SEAT_PX[1])], axis=-1) @ T_world_camera[:3, :3].T
+    below = cast(MapMeshFile(folder.require(MAP_MESH)).reduced(MOST_TRIANGLES), T_world_camera[:3, 3], rays)
     image = sequence.frame(frame).image
     height = round(image.shape[0] * below.shape[1] / image.shape[1])
     above = cv2.resize(image, (below.shape[1], height), interpolation=cv2.INTER_AREA)
@@ -72,17 +74,23 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
     images = [sequence.frame(int(k)).image for k in chosen]
     strips = [np.concatenate([image, colour_disparity(predictor.depth(image))]) for image in images]
     trajectories = trajectories_of(folder)
-    scene = MapScene(MapMeshFile(folder.require(MAP_MESH)).reduced(1_000_000))
     top = _narrowed(np.concatenate(strips, axis=1), WIDTH_PX)
-    with figure_style() as new_figure:
-        figure = new_figure(figsize=(7.4, 5.6), layout="constrained")
+    with rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 5.6), layout="constrained")
         draw_trajectories(figure, trajectories, "m")
         left = _raster(figure, WIDTH_PX // 2)
-    map_picture = map_figure(scene.from_above(trajectories["optimised"].positions), trajectories["optimised"])
-    right = _raster(map_picture, WIDTH_PX - WIDTH_PX // 2)
+    right = above(MapMeshFile(folder.require(MAP_MESH)).reduced(MOST_TRIANGLES), WIDTH_PX - WIDTH_PX // 2)
     height = max(left.shape[0], right.shape[0])
     bottom = np.concatenate([_padded(left, height), _padded(right, height)], axis=1)
     return np.concatenate([top, bottom], axis=0)
+
+
+def above(mesh: MapMesh, width: int) -> NDArray[np.uint8]:
+    """The map from above; z ahead is up."""
+    (x0, z0), (x1, z1) = (np.percentile(mesh.points[:, [0, 2]], percent, axis=0) for percent in (0.5, 99.5))
+    x, z = np.meshgrid(np.linspace(x0, x1, width), np.arange(z1, z0, -(x1 - x0) / width))
+    origins = np.stack([x, np.full_like(x, mesh.points[:, 1].min() - 1.0), z], axis=-1)
+    return cast(mesh, origins, np.array([0.0, 1.0, 0.0]))
 
 
 def _raster(figure: Figure, width: int) -> NDArray[np.uint8]:

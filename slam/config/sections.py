@@ -230,7 +230,7 @@ class OutputConfig(Section):
     root: str = Field(default="results", min_length=1, description="parent folder of run folders")
     report: bool = Field(default=True, description="write report.html")
     viewer_triangles: int = Field(
-        default=60_000, ge=0, description="largest number of triangles of the map in the report; 0: pictures only"
+        default=60_000, ge=0, description="largest number of triangles of the map in the report; 0: no map in it"
     )
     keep: Literal["nothing", "drive", "keyframes"] = Field(
         default="drive",

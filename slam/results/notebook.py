@@ -1,20 +1,19 @@
-"""A run as a notebook shows it: errors, the unit of lengths, and the map from above."""
+"""A run as a notebook shows it: errors, and the unit of lengths."""
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
 
 from slam.results.error_columns import COLUMNS, written
 from slam.results.folder import RunFolder
-from slam.runtime.run_files import MAP_ABOVE, REPORT
+from slam.runtime.run_files import REPORT
 from slam.runtime.storage.record import known
 
 
 def html(run: RunFolder) -> str:
     """The run as a piece of HTML without scripts."""
-    metrics, picture = run.metrics(), run.path / MAP_ABOVE
+    metrics = run.metrics()
     rows = [
         [name, *(written(column.value(errors), column.decimals) for column in COLUMNS)]
         for name, errors in metrics.evaluated_errors().items()
@@ -26,9 +25,6 @@ def html(run: RunFolder) -> str:
         notes.append(f"Report: {run.path / REPORT}")
     parts = [f"<h4>{escape(title)}</h4>", f"<table>{table}</table>" if rows else ""]
     parts += [f"<p>{escape(note)}</p>" for note in notes]
-    if picture.is_file():
-        encoded = b64encode(picture.read_bytes()).decode()
-        parts.append(f'<img alt="the map from above" style="max-width: 100%" src="data:image/png;base64,{encoded}">')
     return "".join(parts)
 
 

@@ -13,8 +13,6 @@ DRIVE = "drive.zip"
 KEYFRAMES = "keyframes.npz"
 MAP_MESH = "map_mesh.ply"
 MAP_CLOUD = "map_cloud.ply"
-MAP_ABOVE = "map_above.png"
-MAP_DRIVER = "map_driver.png"
 REPORT = "report.html"
 LOG = "run.log"
 
@@ -49,8 +47,6 @@ MEANINGS = {
     KEYFRAMES: "keyframes of the map, for run --continue",
     MAP_MESH: "map as a mesh, y down",
     MAP_CLOUD: "map as a coloured cloud, y down",
-    MAP_ABOVE: "the map from above",
-    MAP_DRIVER: "the map from the driver's seat",
     REPORT: "this page",
     LOG: "log of the run",
 } | {

@@ -19,10 +19,10 @@ from benchmarking.work import FALSE_DEG, FALSE_M, JobResult
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
+from shared.pictures import draw_trajectories, trajectories_of
 
 from slam.results.error_columns import DASH
 from slam.results.folder import RunFolder
-from slam.results.report.plots import draw_trajectories, trajectories_of
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import Missing
 
@@ -265,7 +265,7 @@ def draw(results: Sequence[JobResult], path: Path) -> None:
     figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
     panels = figure.subfigures(rows, columns, squeeze=False).flat
     for o, panel in zip(chosen, panels):
-        [axes] = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
+        axes = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
         legend = axes.get_legend()
         if legend is not None:
             legend.remove()

@@ -31,7 +31,7 @@ from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, ti
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors
 from slam.results.metrics import MapMetrics, Metrics, Provenance
-from slam.results.report.map_view import write_map_views
+from slam.results.report.map_view import map_view
 from slam.results.report.page import write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
 from slam.results.report.rendering import Picture
@@ -141,9 +141,9 @@ def _run(job: Job, folder: RunFolder) -> None:
     output = job.settings.output
 
     def reported() -> None:
-        views = write_map_views(folder, output.viewer_triangles if output.report else 0)
         if output.report:
-            write_report(folder, depths.pictures(), _loop_pictures(result, job), views, metrics)
+            view = map_view(folder, output.viewer_triangles)
+            write_report(folder, depths.pictures(), _loop_pictures(result, job), view, metrics)
 
     job.progress("report", 0, 1)
     attempt("the report", reported)

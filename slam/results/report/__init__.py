@@ -1,1 +1,1 @@
-"""The report of a run: its page, tables, figures, pictures and the viewer of the map."""
+"""The report of a run: its page, tables, figures, pictures and the map."""

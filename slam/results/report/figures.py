@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
@@ -16,31 +15,35 @@ from slam.evaluation.drift import aligned, paired, segment_drifts
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
 from slam.results.metrics import AcceptedLoop, CoverageMetrics, Stretch
-from slam.results.report.plots import COLOURS, LOOKS, AerialView
-from slam.results.report.rendering import address_of
+from slam.results.report.map_view import MapView
 from slam.runtime.run_files import REFERENCE
 from slam.runtime.storage.record import known
 
-_DASHES = {REFERENCE: "dash", "odometry": "dashdot", "lidar": "dot"}
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito (2008): for every eye
+LOOKS: dict[str, tuple[str, str | None, float, str]] = {  # label, colour (None: that of text), width, dash
+    REFERENCE: ("Ground truth", None, 1.2, "dash"),
+    "network": ("Network, chained", "#e69f00", 1.3, "solid"),
+    "odometry": ("Odometry", "#cc79a7", 1.5, "dashdot"),
+    "optimised": ("Optimised", "#0072b2", 2.0, "solid"),
+    "lidar": ("LiDAR (KISS-ICP)", "#009e73", 1.8, "dot"),
+}
 _STRETCHES = 25  # of a path, over which lengths are compared
 _MAP, _PANEL = 560, 230  # heights, px
+_R_UP_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x right, y ahead, z up
+_SKY = "#e2e8ef"
 
 
 def trajectories_figure(
-    trajectories: Mapping[str, Trajectory],
-    unit: str,
-    loops: Sequence[AcceptedLoop] = (),
-    view: AerialView | None = None,
+    trajectories: Mapping[str, Trajectory], unit: str, loops: Sequence[AcceptedLoop] = ()
 ) -> go.Figure:
-    """Trajectories from above: as written over the map where there is a view of it, else `aligned`.
+    """Trajectories from above, `aligned`.
 
     Args:
         trajectories: by name.
         unit: of their positions.
         loops: accepted ones, whose places are marked on the optimised trajectory.
-        view: the map, in the world of the optimised trajectory.
     """
-    trajectories = aligned(trajectories) if view is None else trajectories
+    trajectories = aligned(trajectories)
     figure = go.Figure()
     for name, trajectory in trajectories.items():
         where = f"x %{{x:.2f}}, z %{{y:.2f}} {unit}"
@@ -52,16 +55,48 @@ def trajectories_figure(
         marker = {"symbol": "circle-open", "size": 9, "color": COLOURS[1]}
         look = {"mode": "markers", "name": "Loops", "marker": marker, "text": text, "hoverinfo": "text"}
         figure.add_trace(go.Scatter(x=_single(at[:, 0]), y=_single(at[:, 2]), **look))
-    if view is not None:
-        written, content = cv2.imencode(
-            ".webp", cv2.cvtColor(view.image, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_WEBP_QUALITY, 85]
+    figure.update_xaxes(title=f"x, right ({unit})")
+    figure.update_yaxes(title=f"z, ahead ({unit})", scaleanchor="x")
+    return figure.update_layout(height=_MAP, hovermode="closest", dragmode="pan")
+
+
+def map_figure(view: MapView) -> go.Figure:
+    """The map in its colours with the drive through it, seen first from one of its cameras."""
+    points, path = (X @ _R_UP_WORLD.T for X in (view.mesh.points, view.T_world_camera[:, :3, 3]))
+    corners = view.mesh.triangles.astype(np.uint16 if len(points) < 2**16 else np.int32)
+    figure = go.Figure(
+        go.Mesh3d(
+            **dict(zip("xyz", map(_single, points.T), strict=True)),
+            **dict(zip("ijk", map(np.ascontiguousarray, corners.T), strict=True)),
+            vertexcolor=[f"#{rgb:06x}" for rgb in view.mesh.colours.astype(np.int64) @ [1 << 16, 1 << 8, 1]],
+            lighting={"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0},
+            hoverinfo="skip",
         )
-        size = {"sizex": view.x[1] - view.x[0], "sizey": view.z[1] - view.z[0], "sizing": "stretch", "layer": "below"}
-        source = address_of(content.tobytes(), "webp") if written else ""
-        figure.add_layout_image(source=source, x=view.x[0], y=view.z[1], xref="x", yref="y", **size)
-        figure.update_xaxes(range=view.x, showgrid=False, zeroline=False)
-        figure.update_yaxes(range=view.z, showgrid=False, zeroline=False)
-    return _from_above(figure, unit)
+    )
+    line, places = {"color": COLOURS[0], "width": 4}, dict(zip("xyz", map(_single, path.T), strict=True))
+    figure.add_scatter3d(**places, mode="lines", line=line, hoverinfo="skip")
+    # a unit of the scene is what is near, for it is clipped at a hundredth of one
+    low, high = (f([f(points, axis=0), f(path, axis=0)], axis=0) for f in (np.min, np.max))
+    size = np.maximum(high - low, 1e-3)
+    T_world_seat = view.T_world_camera[view.seat]
+    eye, ahead = (path[view.seat] + far * _R_UP_WORLD @ T_world_seat[:3, 2] for far in (0.0, view.ahead))
+    camera = {
+        name: dict(zip("xyz", ((X - 0.5 * (low + high)) / view.ahead).tolist(), strict=True))
+        for name, X in {"eye": eye, "center": ahead}.items()
+    }
+    axes = {
+        f"{axis}axis": {"visible": False, "range": [float(a), float(b)]}
+        for axis, a, b in zip("xyz", low, low + size, strict=True)
+    }
+    ratio = dict(zip("xyz", (size / view.ahead).tolist(), strict=True))
+    scene = axes | {
+        "camera": camera,
+        "dragmode": "turntable",
+        "aspectmode": "manual",
+        "aspectratio": ratio,
+        "bgcolor": _SKY,
+    }
+    return figure.update_layout(scene=scene, height=_MAP, showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0})
 
 
 def error_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
@@ -156,9 +191,8 @@ def noise_figure(coverage: CoverageMetrics, by_source: Mapping[str, CoverageMetr
 
 def _line(name: str, x: FloatArray, y: FloatArray, frames: Any, words: str, **more: Any) -> go.Scatter:
     """A line of a trajectory, which tells the frame under the pointer."""
-    label, look = LOOKS.get(name, (name, {"linewidth": 1.8}))
-    colour = {} if look.get("color") in (None, "black") else {"color": look["color"]}
-    line = {"width": look["linewidth"], "dash": _DASHES.get(name, "solid"), **colour}
+    label, colour, width, dash = LOOKS.get(name, (name, None, 1.8, "solid"))
+    line = {"width": width, "dash": dash} | ({} if colour is None else {"color": colour})
     words = f"{'' if frames is None else 'frame %{customdata}: '}{words}<extra>{label}</extra>"
     given = {"mode": "lines", "customdata": frames, "line": line, "name": label, "legendgroup": name, **more}
     return go.Scatter(x=_single(x), y=_single(y), hovertemplate=words, **given)
@@ -168,12 +202,6 @@ def _frames(trajectory: Trajectory, among: Mapping[str, Trajectory]) -> Any:
     """The frame of every row: the row of the same stamp in the longest trajectory."""
     longest = max(among.values(), key=lambda each: len(each.stamps))
     return np.searchsorted(longest.stamps, trajectory.stamps - 1e-6).astype(np.int32)
-
-
-def _from_above(figure: go.Figure, unit: str) -> go.Figure:
-    figure.update_xaxes(title=f"x, right ({unit})")
-    figure.update_yaxes(title=f"z, ahead ({unit})", scaleanchor="x")
-    return figure.update_layout(height=_MAP, hovermode="closest", dragmode="pan")
 
 
 def _panels(*titles: str) -> go.Figure:

@@ -1,4 +1,4 @@
-"""The mesh of a finished map, reduced to what a picture or the report needs; the whole mesh is never in memory."""
+"""The mesh of a finished map, reduced to what the report needs; the whole mesh is never in memory."""
 
 from __future__ import annotations
 
@@ -59,11 +59,6 @@ class MapMeshFile:
         """
         self._vertices, self._faces = map_ply(path)
 
-    @property
-    def triangles(self) -> int:
-        """Number of triangles."""
-        return len(self._faces)
-
     def reduced(self, triangles: int) -> MapMesh:
         """The whole map with at most about so many triangles."""
         if len(self._faces) <= triangles:
@@ -74,12 +69,6 @@ class MapMeshFile:
         corners = (piece["vertices"] for piece in _chunks(self._faces))
         colours = np.concatenate([piece.colours_or_grey for piece in self._pieces()])
         return _clustered(lambda: (piece.points for piece in self._pieces()), colours, corners, cell)
-
-    def near(self, centre: FloatArray, radius: float) -> MapMesh:
-        """All triangles with their three corners within ``radius`` of a point ``(3,)``."""
-        return self._part(
-            np.concatenate([((piece.points - centre) ** 2).sum(axis=1) < radius**2 for piece in self._pieces()])
-        )
 
     def _part(self, inside: NDArray[np.bool_]) -> MapMesh:
         renumbered = np.cumsum(inside) - 1

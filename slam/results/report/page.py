@@ -9,16 +9,15 @@ from urllib.parse import quote
 
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.metrics import LoopsFile, Metrics
+from slam.results.metrics import METRES, LoopsFile, Metrics
 from slam.results.report import tables as report_tables
 from slam.results.report.map_report import map_errors_table, map_filters, map_sizes
-from slam.results.report.map_view import MapViews
-from slam.results.report.plots import length_unit, trajectories_of
+from slam.results.report.map_view import MapView
 from slam.results.report.rendering import Picture, render
 from slam.results.report.tables import Cell, Table, number
 from slam.results.report.verdict import verdict
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.run_files import LOOPS, MEANINGS, REFERENCE, REPORT
+from slam.runtime.run_files import LOOPS, MEANINGS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.storage.record import MISSING, Missing, known
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ def write_report(
     folder: RunFolder,
     depths: Sequence[Picture] = (),
     loops: Sequence[Picture] = (),
-    views: MapViews | None = None,
+    view: MapView | None = None,
     metrics: Metrics | None = None,
 ) -> None:
     """Write ``report.html`` from the files of a folder; also for a failed run.
@@ -47,7 +46,7 @@ def write_report(
         folder: the run, with its trajectories written.
         depths: strips of images and their depth.
         loops: pairs of images of accepted loops.
-        views: of the map, or None without one.
+        view: of the map, or None without one.
         metrics: of the run; None reads ``metrics.json``.
 
     Raises:
@@ -64,14 +63,12 @@ def write_report(
         unit_notes=metrics.unit_notes(),
         key_numbers=[] if metrics.failure else report_tables.key_numbers(metrics),
         what_ran=report_tables.what_ran(metrics),
-        plots=_plots(metrics, _trajectories(folder), length_unit(folder), loops_file, views),
+        plots=_plots(metrics, _trajectories(folder), loops_file, view),
         errors=report_tables.errors(metrics),
         gps=report_tables.gps(metrics),
         no_errors=report_tables.no_errors(metrics),
         depths=depths,
         depth_error=_depth_error(metrics),
-        driver=_driver_picture(views),
-        viewer=None if views is None else views.viewer,
         map=map_sizes(metrics),
         map_filters=map_filters(metrics),
         map_errors=map_errors_table(metrics),
@@ -104,7 +101,7 @@ def _absence(metrics: Metrics, part: object) -> str:
 
 
 def _plots(
-    metrics: Metrics, trajectories: Mapping[str, Trajectory], unit: str, loops: LoopsFile, views: MapViews | None
+    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: LoopsFile, view: MapView | None
 ) -> dict[str, list[Picture]]:
     """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
     from slam.results.report import figures
@@ -118,6 +115,7 @@ def _plots(
             found[section].append(Picture(title, caption, reason=str(error)))
 
     has_truth = REFERENCE in trajectories and len(trajectories) > 1
+    unit = "m" if metrics.unit == METRES else metrics.unit
     gaps, accepted = known(metrics.sequence.bridged) or [], known(loops.accepted) or []
     if trajectories:
         given = (trajectories, "m" if has_truth else unit, accepted)
@@ -135,10 +133,12 @@ def _plots(
     elif trajectories:
         caption = "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
         add("trajectories", "Speed and rotation over time", caption, figures.motion_figure, trajectories, unit, gaps)
-    if views is not None:
-        driven = {name: each for name, each in trajectories.items() if name == "optimised"}
-        caption = "The map from above in its own colours, with the optimised trajectory."
-        add("map", "Map from above", caption, figures.trajectories_figure, driven, unit, (), views.above)
+    if view is not None:
+        caption = (
+            f"A thinned map_mesh.ply with the optimised trajectory, seen first from the camera of frame {view.seat}. "
+            "Drag to turn it, with the right button to move it; the wheel zooms."
+        )
+        add("map", "Map", caption, figures.map_figure, view)
     if (coverage := known(metrics.graph.coverage)) is not None:
         by_source = known(metrics.graph.coverage_by_source) or {}
         add("noise", "Stated noise", _NOISE, figures.noise_figure, coverage, by_source)
@@ -163,13 +163,6 @@ def _signed(value: float | Missing) -> Cell:
     return number(value) if isinstance(value, Missing) else Cell(f"{value:+.2f}")
 
 
-def _driver_picture(views: MapViews | None) -> Picture | None:
-    if views is None:
-        return None
-    caption = f"The map from the driver's seat at frame {views.frame}."
-    return Picture.of_file("Map from the driver's seat", caption, views.driver, "png")
-
-
 def _files(folder: RunFolder) -> Table | None:
     """Every other file of the run with its meaning and size."""
     rows = []
@@ -181,12 +174,13 @@ def _files(folder: RunFolder) -> Table | None:
 
 
 def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
-    """Trajectories to draw; none if a file is damaged or missing, so that the report is still written."""
+    """The trajectories to draw, the reference first; none if a file is damaged, so that the report is still written."""
     try:
-        return trajectories_of(folder)
+        found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
     except SlamError as error:
         logger.info("the report shows no trajectories: %s", error)
         return {}
+    return {name: trajectory for name, trajectory in found.items() if trajectory is not None}
 
 
 def _size(count: int) -> str:

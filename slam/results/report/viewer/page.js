@@ -40,7 +40,8 @@ async function runPacked(element) {
       const { data, layout } = JSON.parse(plot.nextElementSibling.textContent);
       await Plotly.newPlot(plot, data, { ...layout, ...touched, template: template() }, {
         responsive: true, displaylogo: false, plotlyServerURL: "",  // nothing is shared
-        modeBarButtons: [["zoom2d", "pan2d", "resetScale2d", "toImage"]],
+        modeBarButtons: [layout.scene ? ["orbitRotation", "pan3d", "resetCameraDefault3d", "toImage"]
+          : ["zoom2d", "pan2d", "resetScale2d", "toImage"]],
       });
     }
     const redraw = size => plots.forEach(plot => Plotly.relayout(plot, { template: template(), ...size }));

@@ -38,9 +38,3 @@ def test_decimation_reaches_its_number_and_keeps_a_plain_flat(file: MapMeshFile)
     assert 500 < len(mesh.triangles) <= 900
     assert mesh.triangles.max() < len(mesh.points) == len(mesh.colours)
     assert area(mesh) == pytest.approx(area(file.reduced(100_000)), rel=0.1)
-
-
-def test_near_a_point_are_all_whole_triangles(file: MapMeshFile) -> None:
-    mesh = file.near(np.array([0.0, 1.65, 0.0]), 20.0)
-    assert np.linalg.norm(mesh.points - [0.0, 1.65, 0.0], axis=1).max() < 20.0
-    assert area(mesh) == pytest.approx(np.pi * 20.0**2, rel=0.25)

@@ -14,7 +14,7 @@ import pytest
 
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.report.map_view import MapViews
+from slam.results.report.map_view import MapView
 from slam.results.report.page import write_report
 from slam.results.report.rendering import Picture
 
@@ -63,16 +63,20 @@ def plots(html: str) -> dict[str, Any]:
     return {title: json.loads(plot) for title, plot in found}
 
 
+def surface_corners(surface: dict[str, Any]) -> np.ndarray:
+    return np.stack([values(surface[axis], "u2") for axis in "ijk"])
+
+
 def values(packed: dict[str, str], kind: str) -> np.ndarray:
     assert packed["dtype"] == kind
     return np.frombuffer(base64.b64decode(packed["bdata"]), kind)
 
 
 @pytest.fixture
-def full(make_run: MakeRun, map_views: MapViews) -> RunFolder:
+def full(make_run: MakeRun, view: MapView) -> RunFolder:
     folder = make_run()
     strip = Picture.of_file("Frame 10", "Frame 10", b"a picture", "jpeg")
-    write_report(folder, [strip], [], map_views)
+    write_report(folder, [strip], [], view)
     return folder
 
 
@@ -90,14 +94,14 @@ def test_a_full_report_is_balanced_and_needs_no_network(full: RunFolder) -> None
 
 def test_its_plots_have_the_numbers_of_the_run(full: RunFolder) -> None:
     html, balance = parsed(full)
-    assert [attrs["alt"] for tag, attrs in balance.tags if tag == "img"] == ["Frame 10", "Map from the driver's seat"]
+    assert [attrs["alt"] for tag, attrs in balance.tags if tag == "img"] == ["Frame 10"]
     found = plots(html)
     assert list(found) == [
         "Trajectories from above",
         "Scale and rotation over time",
         "Position error along the path",
         "Drift by the length of segments",
-        "Map from above",
+        "Map",
         "Stated noise",
     ]
     lines = {line["name"]: line for line in found["Position error along the path"]["data"]}
@@ -106,8 +110,11 @@ def test_its_plots_have_the_numbers_of_the_run(full: RunFolder) -> None:
     assert values(lines["Optimised"]["customdata"], "i4").tolist() == list(range(300))
     (scale, *_) = (line for line in found["Scale and rotation over time"]["data"] if line["name"] == "Optimised")
     assert values(scale["y"], "f4") == pytest.approx(1.01, abs=0.002)
-    (image,) = found["Map from above"]["layout"]["images"]
-    assert image["source"].startswith("data:image/webp;base64,")
+    surface, path = found["Map"]["data"]
+    assert (surface["type"], path["type"]) == ("mesh3d", "scatter3d")
+    assert len(surface["vertexcolor"]) == len(values(surface["x"], "f4")) > surface_corners(surface).max()
+    assert values(path["y"], "f4").tolist() == list(range(60))  # ahead
+    assert values(surface["z"], "f4").min() == pytest.approx(-1.65, abs=0.01)  # the ground is below
     assert html.count('id="plotly"') == 1
 
 

@@ -120,11 +120,12 @@ def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibra
     # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
     usual = running_median(lengths, _NEAREST_PAIRS + 1)
     reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
+    # a unit that is unknown is so for all steps alike, and wide enough by itself
+    widening = np.sqrt(_CORRELATED_STEPS) if calibration.pairs else 1.0
     factors = []
     for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
         sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)
-        widened = np.sqrt(_CORRELATED_STEPS) * sigmas
-        factors.append(RelativePose(k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widened, STUDENT_T_DOF))
+        factors.append(RelativePose(k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widening * sigmas, STUDENT_T_DOF))
     return factors
 
 

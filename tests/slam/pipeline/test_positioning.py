@@ -92,7 +92,7 @@ def test_gps_holds_a_drifting_odometry_despite_outliers() -> None:
     positions = [r.location.T_enu_world @ r.optimised.T_world_camera for r in (beside, within)]
     frame = within.location.fixes.frame.points(LocalFrame(PLACE).places(se3.apply(T_ENU_WORLD, path()[:, :3, 3])))
     errors = [float(np.linalg.norm(T[:, :3, 3] - frame, axis=1).mean()) for T in positions]
-    assert errors[1] < 0.4 and 2 * errors[1] < errors[0]
+    assert errors[1] < 0.5 and 2 * errors[1] < errors[0]
 
 
 def test_a_track_that_does_not_fit_is_refused() -> None:

@@ -14,7 +14,7 @@ Pixels = NDArray[np.float32]
 _LIMITS = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
 # least eigenvalue of a window's gradients: a tenth of what OpenCV wants, for plain walls
 _LEAST_TEXTURE = 1e-5
-_TILES = 3, 4
+_TILES = 3, 4  # down and across: corners are spread over them
 
 
 def lucas_kanade(
@@ -67,11 +67,14 @@ def new_corners(
 ) -> Pixels:
     """Up to ``count`` Shi-Tomasi corners ``(M, 2)``, apart from each other and from those taken.
 
+    All tiles of the image get equally many for as long as they have some, those that are taken among them: one thing
+    that is all texture would have them all, be it the world or not.
+
     Args:
         grey: ``(H, W)``.
         taken: corners ``(K, 2)`` in the image.
         count: of new corners.
-        quality: least strength of a corner over that of the strongest one.
+        quality: least strength of a corner over that of the strongest one of its tile.
         spacing_px: least distance between corners, pixels.
         block_px: side of the surroundings by which a corner is judged, pixels.
         hidden: where no corner is wanted ``(h, w)``, in any size.
@@ -81,19 +84,17 @@ def new_corners(
     free = _away_from(taken, int(spacing_px), grey.shape)
     if hidden is not None:
         free[resized_mask(hidden, *grey.shape[::-1])] = 0
-    found, rank = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.int64)]
+    found, ranks = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.int64)]
     for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
         for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
-            at = slice(top, bottom), slice(left, right)
-            corners = cv2.goodFeaturesToTrack(
-                grey[at], count, quality, spacing_px, mask=np.ascontiguousarray(free[at]), blockSize=block_px
-            )
+            tile, mask = grey[top:bottom, left:right], np.ascontiguousarray(free[top:bottom, left:right])
+            corners = cv2.goodFeaturesToTrack(tile, count, quality, spacing_px, mask=mask, blockSize=block_px)
             if corners is not None:
-                here = ((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1).sum()
-                found.append(corners.reshape(-1, 2) + np.float32([left, top]))
-                rank.append(here + np.arange(len(corners)))
-    order = np.argsort(np.concatenate(rank), kind="stable")[:count]
-    return np.concatenate(found)[order]
+                before = np.count_nonzero(((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1))
+                found.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
+                ranks.append(before + np.arange(len(corners)))
+    order = np.argsort(np.concatenate(ranks), kind="stable")[:count]
+    return np.asarray(np.concatenate(found)[order])
 
 
 def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ from slam.frontend import sparse_flow
 from slam.frontend.sparse_flow import Pixels, are_inside, lucas_kanade
 
 _CORNER_SPACING_PX = 12.0  # least distance between corners, pixels
-_CORNER_QUALITY = 0.0003  # least corner strength over that of the strongest corner
+_CORNER_QUALITY = 0.0003  # least corner strength over that of the strongest corner of a tile
 _CORNER_BLOCK_PX = 3
 _WINDOW_PX = 15  # side of the Lucas-Kanade window
 _FORWARD_BACKWARD_PX = 0.7  # largest forward-backward tracking error

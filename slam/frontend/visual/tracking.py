@@ -23,7 +23,7 @@ from slam.geometry.se3 import FloatArray
 _PREDICTED_LEVELS = 2
 _LIMITS = 30, 0.01  # most iterations, and the shift in pixels below which they end
 _CORNER_BLOCK_PX = 5
-_CORNER_QUALITY = 0.003  # least corner strength over that of the strongest corner
+_CORNER_QUALITY = 0.008  # least corner strength over that of the strongest corner of a tile
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 _PYRAMID_LEVELS = 4  # image pyramid levels above the full image
 _FORWARD_BACKWARD_PX = 0.5  # largest forward-backward tracking error, pixels

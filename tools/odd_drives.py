@@ -85,6 +85,18 @@ def _noisy(image: Image, k: int) -> Image:
     return np.asarray(np.clip(image + np.random.default_rng(k).normal(0, 25, image.shape), 0, 255), np.uint8)
 
 
+def _passed(image: Image, k: int) -> Image:
+    """Behind a textured block of 60 % x 80 % of the image, which crosses it at a fiftieth of its width a frame."""
+    height, width = image.shape[:2]
+    rows, columns = round(0.8 * height), round(0.6 * width)
+    texture = np.random.default_rng(4).integers(30, 220, (rows // 8, columns // 8, 3)).astype(np.uint8)
+    block = cv2.resize(texture, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    M = np.array([[1.0, 0.0, k * width / 50 - columns], [0.0, 1.0, height - rows]])
+    passing = image.copy()
+    cv2.warpAffine(block, M, (width, height), passing, borderMode=cv2.BORDER_TRANSPARENT)
+    return passing
+
+
 def _every(stride: int) -> Callable[[Drive], Drive]:
     return lambda drive: drive.selected(range(0, len(drive.images), stride), drive.stamps[::stride])
 
@@ -120,6 +132,7 @@ ODDITIES: dict[str, Callable[[Drive], Drive]] = {
     "patterned bonnet": _changed(_bonneted),
     "night": _changed(_at_night),
     "noise": _changed(_noisy),
+    "a block that passes": _changed(_passed),
     "the first half twice": _twice,
 }
 FOCAL = "focal length 1.3 times too large"  # of the camera, not of its images

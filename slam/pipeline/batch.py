@@ -151,20 +151,23 @@ class SlamPipeline:
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
         scale, factors, T_odometry = self._measure(drive, T_network, steps, agreements)
-        support = agreement.frame_support(range(len(drive)), drive.motions, drive.map_poses.segments)
+        support = None if drive.maps else agreement.frame_support(range(len(drive)), drive.motions)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
-        of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
+        camera = self._sequence.intrinsics
+        of_images = agreement.of_images(drive, state.odometry, camera, support, scale.contradicted, needs_road)
+        if not drive.maps:
+            of_images.append(agreement.of_directions(T_odometry))
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         if drive.maps and self._config.loops.enabled:
             loops = closure.closures(scale)
         else:
             with self._watch.stage("loops"):
-                camera, config = self._sequence.intrinsics, self._config.loops
-                loops = close_loops(views, T_odometry, camera, config, scale.is_metric, self._seed)
+                loops = close_loops(views, T_odometry, camera, self._config.loops, scale.is_metric, self._seed)
         graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
         if self._positioning is not None and self._positioning.agreement is not None:
             by_gps = self._positioning.agreement
             agreements.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
+        trusted = [*(each for each in agreements if not each.is_wrong), *of_images]
         reference = self._sequence.reference
         return Estimate(
             network=self._trajectory(T_network),
@@ -183,7 +186,7 @@ class SlamPipeline:
             first=self.first,
             stopwatch=self._watch,
             agreements=(*agreements, *of_images),
-            confidence=agreement.confidence([*(each for each in agreements if not each.is_wrong), *of_images]),
+            confidence=agreement.confidence(trusted, scale.is_metric, bool(drive.maps)),
             support=support,
         )
 

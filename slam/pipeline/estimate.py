@@ -30,8 +30,8 @@ class Estimate:
     ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
     ``state`` is that of the front end, for a run that continues this one; frames before ``first`` are of earlier runs.
     ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
-    each optional source contradicts the images, ``confidence`` what follows from
-    all of them; ``support`` ``(N,)`` is that of the motion to each frame.
+    each optional source contradicts the images, ``confidence`` what follows from all of them, or why nothing does;
+    ``support`` ``(N,)`` is that of the motion to each frame, None where maps of keyframes give the poses.
     """
 
     network: Trajectory
@@ -49,8 +49,8 @@ class Estimate:
     location: Location | MeasurementFailure | None
     first: int
     stopwatch: Stopwatch
-    confidence: float
-    support: FloatArray
+    confidence: float | MeasurementFailure
+    support: FloatArray | None
     agreements: tuple[Agreement, ...] = ()
     map: TsdfMap | None = None
 

@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
+from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError, sequence_errors
 
 DEFAULT_FPS = 10.0
@@ -118,6 +120,11 @@ def height_beside(usual_m: float | None, *folders: Path) -> float | None:
     """The camera's height by the first ``camera.yaml`` found in ``folders``; ``usual_m`` where none says it."""
     found = beside(*folders)
     return usual_m if found is None else found.height_or(usual_m)
+
+
+def as_known(intrinsics: Intrinsics, asked: Path | None) -> Intrinsics:
+    """The same camera; a guess where the user gave a field of view alone."""
+    return replace(intrinsics, is_guess=asked is not None and is_field_of_view(asked))
 
 
 def is_field_of_view(given: Path) -> bool:

@@ -13,7 +13,6 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import get_args
 
@@ -33,7 +32,6 @@ from slam.simulation.options import SimulationOptions
 
 WORDS = ("every word of this line hides a part of the road", "and the next line hides another part of it")
 FRAMES = 110
-WRONG = 1.0  # percent of the path
 
 
 def _zoomed(image: Image, ratio: float) -> Image:
@@ -139,6 +137,16 @@ FOCAL = "focal length 1.3 times too large"  # of the camera, not of its images
 
 
 @dataclass(frozen=True)
+class OddDrive:
+    """A drive with the camera that took it, and the ratio of the focal length that the run is told to the true one."""
+
+    name: str
+    drive: Drive
+    camera: FrameSequence
+    focal_ratio: float = 1.0
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Error in percent of the path and confidence of a drive, NaN where it was refused; what is doubted most."""
 
@@ -152,13 +160,13 @@ class Outcome:
         return [self.name, f"{self.error_percent:.1f}", f"{self.confidence:.2f}", self.doubt]
 
 
-def examine(name: str, drive: Drive, camera: FrameSequence, weights: str, focal_ratio: float = 1.0) -> Outcome:
-    """Run one drive through the public door."""
+def examine(odd: OddDrive, weights: str, keep: Path | None) -> Outcome:
+    """Run one drive through the public door; its run folder lies in ``keep``, where that is given."""
     with tempfile.TemporaryDirectory() as place:
-        root = Path(place) / "root"
-        write_root(root, drive, camera, focal_ratio)
+        root, name = Path(place) / "root", odd.name
+        write_root(root, odd.drive, odd.camera, odd.focal_ratio)
         try:
-            run = run_slam(root, "sim", weights=weights, output=Path(place) / "run", overrides=OVERRIDES)
+            run = run_slam(root, "sim", weights=weights, output=(keep or Path(place)) / name, overrides=OVERRIDES)
         except SlamError as error:
             return Outcome(name, np.nan, np.nan, f"refused: {error}".replace(str(root), "ROOT"))
         metrics = run.metrics()
@@ -170,63 +178,50 @@ def examine(name: str, drive: Drive, camera: FrameSequence, weights: str, focal_
     return Outcome(name, percent, known(metrics.confidence.run) or 0.0, doubt)
 
 
-def _of_recording(dataset: Path, name: str | None, frames: str | None, weights: str) -> Iterator[Outcome]:
+def _of_recording(dataset: Path, name: str | None, frames: str | None) -> Iterator[OddDrive]:
     """Every oddity of a piece of a recording."""
     piece = open_sequence(dataset, name, frames=frames)
     drive = whole(piece)
     for oddity, change in ODDITIES.items():
-        yield examine(f"{piece.name}, {oddity}", change(drive), piece, weights)
-    yield examine(f"{piece.name}, {FOCAL}", drive, piece, weights, focal_ratio=1.3)
+        yield OddDrive(f"{piece.name}, {oddity}", change(drive), piece)
+    yield OddDrive(f"{piece.name}, {FOCAL}", drive, piece, focal_ratio=1.3)
 
 
-def _simulated(seeds: range, weights: str) -> Iterator[Outcome]:
+def _simulated(seeds: range) -> Iterator[OddDrive]:
     """Worlds as they are and in each weather; of every third seed all oddities."""
     weathers = [(), *((hazard,) for hazard in get_args(Hazard)), get_args(Hazard)]
     for seed in seeds:
         for weather in weathers:
             camera = SimulatedSequence(SimulationOptions("grid", FRAMES, seed, hazards=weather))
-            yield examine(f"world {seed}, {', '.join(weather) or 'as it is'}", whole(camera), camera, weights)
+            yield OddDrive(f"world {seed}, {', '.join(weather) or 'as it is'}", whole(camera), camera)
         if seed % 3 == 0:
             camera = SimulatedSequence(SimulationOptions("grid", FRAMES, seed))
             drive = whole(camera)
             for oddity in list(ODDITIES)[1:]:
-                yield examine(f"world {seed}, {oddity}", ODDITIES[oddity](drive), camera, weights)
-            yield examine(f"world {seed}, {FOCAL}", drive, camera, weights, focal_ratio=1.3)
-
-
-def summary(outcomes: Sequence[Outcome]) -> list[str]:
-    """How many drives err by how much, by their confidence."""
-    ran = [each for each in outcomes if np.isfinite(each.error_percent)]
-    lines = []
-    for least, most in pairwise((0.0, 0.3, 0.6, 0.85, 1.01)):
-        among = [each for each in ran if least <= each.confidence < most]
-        right = sum(each.error_percent <= WRONG for each in among)
-        lines.append(
-            f"confidence {least:.1f} to {min(most, 1):.1f}: {right} of {len(among)} err by at most {WRONG:g} %"
-        )
-    return lines
+                yield OddDrive(f"world {seed}, {oddity}", ODDITIES[oddity](drive), camera)
+            yield OddDrive(f"world {seed}, {FOCAL}", drive, camera, focal_ratio=1.3)
 
 
 @one_line_errors()
 def main(words: Sequence[str] | None = None) -> None:
-    """Run odd drives and print a row of a table each, then what the confidence was worth."""
+    """Run odd drives and print a row of a table each."""
     parser = parser_of(__doc__)
     parser.add_argument("--dataset", type=Path, help="a data set with true poses; else simulated worlds")
     parser.add_argument("--sequence")
     parser.add_argument("--frames", help="A:B, half-open")
     parser.add_argument("--seeds", help="A:B, of simulated worlds", default="840:846")
     parser.add_argument("--weights", default="default")
+    parser.add_argument("--keep", type=Path, help="folder for the run folders, which fit_confidence.py reads")
     options = parser.parse_args(words)
     if options.dataset is not None:
-        drives = _of_recording(options.dataset, options.sequence, options.frames, options.weights)
+        drives = _of_recording(options.dataset, options.sequence, options.frames)
     else:
-        drives = _simulated(range(*map(int, options.seeds.split(":"))), options.weights)
+        drives = _simulated(range(*map(int, options.seeds.split(":"))))
     outcomes = []
-    for outcome in drives:
-        outcomes.append(outcome)
+    for odd in drives:
+        outcomes.append(outcome := examine(odd, options.weights, options.keep))
         print(f"{outcome.name}: {outcome.error_percent:.1f} %, confidence {outcome.confidence:.2f}", file=sys.stderr)
     print(markdown(("drive", "error, % of the path", "confidence", "largest doubt"), [o.row() for o in outcomes]))
-    print("\n".join(summary(outcomes)))
 
 
 if __name__ == "__main__":

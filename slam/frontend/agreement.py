@@ -32,7 +32,7 @@ _USUAL_HEIGHT_M, _USUAL_FACTOR = 1.0, 10.0  # of cameras whose height nobody sta
 _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
-_FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens bias it
+_FOCAL = 0.04  # relative, of the focal length that corners show: flow and lens bias it
 _TELLING_FOCAL, _ADVISED = 0.1, 0.5  # largest sigma of one that says something; sigmas of a guess worth another one
 # of good drives (docs/reliability.md): mean and spread
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
@@ -40,12 +40,11 @@ _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
-_LEAST_MOVED, _ALONG, _ASIDE_SPREAD = 0.2, np.cos(np.deg2rad(20.0)), 0.01  # of long steps; of their directions
+_LEAST_MOVED, _ALONG, _ASIDE_SPREAD = 0.1, np.cos(np.deg2rad(20.0)), 0.01  # of long steps; of their directions
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
-# share of drives that err by at most 1 % of their path, over their largest contradiction (tools/fit_confidence.py):
-# the best, the sigmas that halve it, and how fast it falls
-CONFIDENCE = (0.97, 2.0, 5.5)
-_CAPPED = 2.5  # sigmas of what leaves a confidence of less than a half
+# of `share_right`, by tools/fit_confidence.py
+CONFIDENCE = (0.97, 3.0, 5.5)
+_CAPPED = 3.0  # sigmas of what leaves a confidence of less than a half
 
 
 @dataclass(frozen=True)
@@ -221,6 +220,15 @@ def confidence(agreements: Iterable[Agreement], is_metric: bool, is_carried: boo
         return MeasurementFailure("it is calibrated on roads, not for a camera that is carried")
     if not is_metric:
         return MeasurementFailure("it is calibrated for lengths in metres")
-    best, half, steepness = CONFIDENCE
-    most = max((each.sigmas for each in agreements), default=0.0)
-    return float(best / (1.0 + (max(most, 0.0) / half) ** steepness))
+    return float(share_right(max((each.sigmas for each in agreements), default=0.0), CONFIDENCE))
+
+
+def share_right(sigmas: FloatArray | float, constants: tuple[float, float, float]) -> FloatArray:
+    """The share of drives that err by at most 1 % of their path, by their largest contradiction ``(N,)``.
+
+    Args:
+        sigmas: of the contradictions.
+        constants: the best share, the sigmas that halve it, and how steeply it falls.
+    """
+    best, half, steepness = constants
+    return np.asarray(best / (1.0 + (np.maximum(sigmas, 0.0) / half) ** steepness))

@@ -1,7 +1,7 @@
 """Fit the confidence of runs to drives with true poses, and judge it on drives that the fit did not see.
 
-Reads run folders by the name DRIVE or ``DRIVE, ODDITY``, as ``odd_drives.py --keep RUNS`` leaves them. A run is right if
-it errs by at most 1 % of its path (6 dof). A drive is left out with all its oddities. Runs whose focal length is wrong
+Reads run folders by the name DRIVE or ``DRIVE, ODDITY``, as ``odd_drives.py --keep RUNS`` leaves them. A run is right
+if it errs by at most 1 % of its path (6 dof). A drive is left out with all its oddities. Runs whose focal length is wrong
 are judged, but not fitted: where nothing turns nothing shows it.
 
 The constants in use are of commit cae833d3 with ``default`` weights and without a map: whole KITTI 00, 02, 05 (300
@@ -58,7 +58,7 @@ def outcomes(runs: Path) -> Iterator[Outcome]:
 
 
 def fit(found: Sequence[Outcome]) -> tuple[float, float, float]:
-    """The sigmas that halve the confidence, of greatest likelihood; few drives lie between, so the rest is as in use."""
+    """Constants with the likeliest sigmas that halve the confidence; too few drives lie between to fit the others."""
     sigmas = np.array([each.sigmas for each in found])
     right = np.array([each.error <= RIGHT for each in found])
     best, _, steepness = CONFIDENCE
@@ -100,12 +100,9 @@ def main(words: Sequence[str] | None = None) -> None:
     right = np.mean([each.error <= RIGHT for each in known_cameras])
     print(markdown(("confidence by the other drives", "runs", "mean", "share right"), rows(known_cameras, stated), 3))
     in_use = np.array([share_right(each.sigmas, CONFIDENCE) for each in known_cameras])
-    print(
-        f"\nBrier score {brier(known_cameras, stated):.3f} by the other drives, {brier(known_cameras, in_use):.3f} as in"
-    )
-    print(
-        f"use, {right * (1 - right):.3f} of a constant; best, half and steepness {fit(known_cameras)}, in use {CONFIDENCE}"
-    )
+    scores = brier(known_cameras, stated), brier(known_cameras, in_use), right * (1 - right)
+    print("Brier score {:.3f} by the other drives, {:.3f} as in use, {:.3f} of a constant".format(*scores))
+    print(f"best, half and steepness {fit(known_cameras)} by all drives, {CONFIDENCE} in use")
     for each in every:
         if FOCAL in each.name:
             print(f"{each.name}: {100 * each.error:.1f} %, {share_right(each.sigmas, CONFIDENCE):.2f}")

@@ -1,7 +1,7 @@
 """Fit the confidence of runs to drives with true poses, and judge it on drives that the fit did not see.
 
 Reads run folders by the name DRIVE or ``DRIVE, ODDITY``, as ``odd_drives.py --keep RUNS`` leaves them. A run is right
-if it errs by at most 1 % of its path (6 dof). A drive is left out with all its oddities. Runs whose focal length is wrong
+if it errs by at most 1 % of its path (6 dof). A drive is left out with all its oddities. Runs with a wrong focal length
 are judged, but not fitted: where nothing turns nothing shows it.
 
 The constants in use are of commit cae833d3 with ``default`` weights and without a map: whole KITTI 00, 02, 05 (300

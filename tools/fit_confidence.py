@@ -6,7 +6,8 @@ are judged, but not fitted: where nothing turns nothing shows it.
 
 The constants in use are of commit cae833d3 with ``default`` weights and without a map: whole KITTI 00, 02, 05 (300
 frames each), raw drive 0013, 110 frames of KITTI 03, ten simulated worlds (seeds 620 to 629, clean and with all
-hazards), and 60 frames of 00, 02, 05, 0013 and worlds 621 and 623 as `ODDITIES` of ``odd_drives.py`` change them.
+hazards), and 60 frames (all of them where frames are dropped) of 00, 02, 05, 0013 and worlds 621 and 623 as `ODDITIES`
+of ``odd_drives.py`` change them.
 
 Example: python tools/fit_confidence.py RUNS
 """

@@ -201,7 +201,7 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
             fov = 2.0 * np.arctan(camera.width / (2.0 * camera.fx * np.exp(logarithm)))
             figure += f": try fov={np.rad2deg(fov):.0f}"
     if camera.is_guess:
-        return Agreement("the field of view", max(sigmas, _CAPPED), figure, "good drives")
+        return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
     return Agreement("the focal length", sigmas, figure) if figure else None
 
 

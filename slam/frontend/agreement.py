@@ -33,7 +33,7 @@ _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
 _FOCAL = 0.04  # relative, of the focal length that corners show: flow and lens bias it
-_TELLING_FOCAL, _ADVISED = 0.1, 0.5  # largest sigma of one that says something; sigmas of a guess worth another one
+_TELLING_FOCAL = 0.1  # largest sigma of one that says something
 # of good drives (docs/reliability.md): mean and spread
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
@@ -197,7 +197,7 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     if sigma < _TELLING_FOCAL or sigmas > DOUBTFUL:
         figure += f"{', ' if figure else ''}corners show {100 * np.exp(logarithm):.0f} % of it"
         figure += f", with a sigma of {100 * sigma:.0f} %"
-        if sigmas > (_ADVISED if camera.is_guess else DOUBTFUL):
+        if sigmas > DOUBTFUL:
             fov = 2.0 * np.arctan(camera.width / (2.0 * camera.fx * np.exp(logarithm)))
             figure += f": try fov={np.rad2deg(fov):.0f}"
     if camera.is_guess:

@@ -134,7 +134,7 @@ CHANGES: dict[str, Callable[[Drive], Drive]] = {
 }
 
 
-def run(drive: Drive, camera: FrameSequence, weights: str, place: Path) -> RunFolder:
+def run(drive: Drive, camera: FrameSequence, weights: str, place: Path, output: Path) -> RunFolder:
     """Write the images with their camera and true poses, and run them through the public door."""
     lines = {name: getattr(camera.intrinsics, name) for name in ("width", "height", "cx", "cy")}
     lines |= {name: drive.focal_ratio * getattr(camera.intrinsics, name) for name in ("fx", "fy")}
@@ -145,15 +145,14 @@ def run(drive: Drive, camera: FrameSequence, weights: str, place: Path) -> RunFo
     write_lines(place / "camera.yaml", [f"{key}: {value}" for key, value in lines.items()])
     write_lines(place / "times.txt", [f"{stamp:.6f}" for stamp in drive.stamps])
     write_poses(place / "truth.txt", drive.T_world_camera)
-    output, truth = place / "run", place / "truth.txt"
-    return run_slam(place, weights=weights, truth=truth, output=output, overrides=OVERRIDES)
+    return run_slam(place, weights=weights, truth=place / "truth.txt", output=output, overrides=OVERRIDES)
 
 
-def row(name: str, drive: Drive, camera: FrameSequence, weights: str) -> list[str]:
+def row(name: str, drive: Drive, camera: FrameSequence, weights: str, keep: Path | None) -> list[str]:
     """Of the table: the drive, its error and confidence, and the refusal or what was bridged, cut and doubted most."""
     with tempfile.TemporaryDirectory() as place:
         try:
-            metrics = run(drive, camera, weights, Path(place)).metrics()
+            metrics = run(drive, camera, weights, Path(place), (keep or Path(place)) / name).metrics()
         except SlamError as refusal:
             return [name, "-", "-", f"refused: {refusal}".replace(place, "ROOT")]
     ate_m, length_m = known(metrics.trajectories.optimised.align.dof6.ate_rmse_m), known(metrics.sequence.length_m)
@@ -175,6 +174,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", help="A:B, of simulated worlds", default="840:846")
     parser.add_argument("--change", action="append", choices=list(CHANGES), help="default: every one; repeat")
     parser.add_argument("--weights", default="default")
+    parser.add_argument("--keep", type=Path, help="folder for the run folders, which fit_confidence.py reads")
     o = parser.parse_args(words)
     cameras: list[FrameSequence] = []
     if o.dataset is not None:
@@ -188,7 +188,7 @@ def main(words: Sequence[str] | None = None) -> None:
         images = [camera.frame(k).image for k in range(len(camera))]
         drive = Drive(images, camera.stamps, np.asarray(camera.reference))
         for change in o.change or CHANGES:
-            rows.append(row(f"{camera.name}, {change}", CHANGES[change](drive), camera, o.weights))
+            rows.append(row(f"{camera.name}, {change}", CHANGES[change](drive), camera, o.weights, o.keep))
             print(*rows[-1][:3], file=sys.stderr)
     print(markdown(("drive", "error, % of the path", "confidence", "said"), rows))
 

@@ -157,6 +157,7 @@ def doctor(
 
 def _print_run(path: Path, metrics: Metrics) -> None:
     from slam.results.error_columns import written
+    from slam.results.report.verdict import verdict
     from slam.results.terminal_tables import metrics_table
     from slam.runtime.run_files import REPORT
     from slam.runtime.storage.record import Missing, known
@@ -169,14 +170,14 @@ def _print_run(path: Path, metrics: Metrics) -> None:
         print_table(metrics_table(metrics.evaluated_errors(), title))
     if (sure := known(metrics.confidence.run)) is not None:
         typer.echo(f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path")
+    if (found := verdict(metrics)) is not None and found.doubts:
+        typer.echo(f"doubts: {'; '.join(found.doubts)}")
     for note in metrics.unit_notes():
         typer.echo(note)
     for gap in sequence.bridged:
         typer.echo(f"INTERPOLATED: frames {gap.first} to {gap.last}: {gap.reason}")
     depth = "" if provenance.depth_source == "network" else f"; depth {known(provenance.depth_source)}"
     typer.echo(f"weights {known(provenance.weights)}: {known(provenance.weights_licence)}{depth}")
-    if provenance.leak is True:
-        typer.echo("LEAK: these weights were trained on frames of this sequence")
     frames, before = known(sequence.frames) or 0, known(sequence.continued_at) or 0
     processed = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
     seconds, per_second = written(timing.seconds_total, 1), written(timing.frames_per_second, 1)

@@ -6,15 +6,17 @@ Also how far the images of a drive are from those of good drives, and the confid
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from slam.frames import Ends, RelativePose
+from slam.frames import Ends, Intrinsics, RelativePose, runs
 from slam.frontend.drive import Drive
+from slam.frontend.failure import MeasurementFailure
 from slam.frontend.segments import named
 from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState
 from slam.geometry.robust import mad_sigma
@@ -30,15 +32,19 @@ _USUAL_HEIGHT_M, _USUAL_FACTOR = 1.0, 10.0  # of cameras whose height nobody sta
 _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
-_FOCAL = 0.06  # relative, of the focal length that corners show: flow and lens bias it
+_FOCAL = 0.04  # relative, of the focal length that corners show: flow and lens bias it
+_TELLING_FOCAL = 0.1  # largest sigma of one that says something
 # of good drives (docs/reliability.md): mean and spread
-USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
+_USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
+_WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
+_LEAST_MOVED, _ALONG, _ASIDE_SPREAD = 0.1, np.cos(np.deg2rad(20.0)), 0.01  # of long steps; of their directions
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
-# share of drives whose largest contradiction has so many sigmas that err by at most 1 % of their path
-_SIGMAS, _CONFIDENCE = (1.0, 1.5, 2.0, 3.0, 5.0), (0.97, 0.85, 0.5, 0.2, 0.05)
+# of `share_right`, by tools/fit_confidence.py
+CONFIDENCE = (0.97, 3.0, 5.5)
+_CAPPED = 3.0  # sigmas of what leaves a confidence of less than a half
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,18 @@ def of_positions(source: str, distances: FloatArray, sigmas: FloatArray, path_m:
     return Agreement(source, mad_sigma(distances / noise), f"its positions lie {median:.1f} m off the path, median")
 
 
+def of_directions(T_odometry: FloatArray) -> Agreement:
+    """By poses ``(N, 4, 4)`` of a vehicle: it goes along one axis of its camera, forwards or backwards."""
+    steps = (invert(T_odometry[:-1]) @ T_odometry[1:])[:, :3, 3]
+    lengths = np.linalg.norm(steps, axis=1)
+    moved = steps[lengths > _LEAST_MOVED * np.quantile(lengths, 0.9)]
+    _, axes = np.linalg.eigh(moved.T @ moved)
+    along = np.abs(moved @ axes[:, -1]) / np.linalg.norm(moved, axis=1)
+    aside = float((along < _ALONG).mean()) if len(moved) else 0.0
+    figure = f"{100 * aside:.1f} % of them point {np.rad2deg(np.arccos(_ALONG)):.0f} degrees or more aside"
+    return Agreement("the direction of steps", aside / _ASIDE_SPREAD, figure, "good drives").said()
+
+
 def of_depth(source: str, error: DepthError) -> Agreement | None:
     """By the spread of its ratio to triangulated depth; None where few corners tell."""
     spread = error.total_spread
@@ -116,20 +134,26 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
 
 
 def of_images(
-    drive: Drive, odometry: OdometryState, support: FloatArray, contradicted: Sequence[Ends], needs_road: bool
+    drive: Drive,
+    odometry: OdometryState,
+    camera: Intrinsics,
+    support: FloatArray | None,
+    contradicted: Sequence[Ends],
+    needs_road: bool,
 ) -> list[Agreement]:
     """How far the images of a completed drive are from those of good drives, in the log too.
 
     Args:
         drive: all its measurements.
         odometry: what its corners say of the camera and of learned depth.
-        support: of the frames ``(N,)``, by `frame_support`.
+        camera: that of the images.
+        support: of the frames ``(N,)``, by `frame_support`; None where maps of keyframes give the poses.
         contradicted: steps whose length learned depth or the speed before contradicts.
         needs_road: whether lengths are measured on the road.
     """
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
     steps = 0 if drive.maps else len(drive.steps.triangulated)  # lengths are then those of the maps
-    on_road, mean = len(drive.road_steps), float(support.mean())
+    on_road = len(drive.road_steps)
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
     found = [("gaps", gaps, figure)]
@@ -137,9 +161,8 @@ def of_images(
         figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
         figure += f", which end at frames {named([last for _, last in contradicted])}" if contradicted else ""
         found.append(("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure))
-    if drive.motions or drive.failures or drive.map_poses.segments:  # else nothing was asked of the corners
-        figure = f"{100 * mean:.0f} % of the corners fit in the next image"
-        found.append(("the overlap of images", float(_support_sigmas(mean)), figure))
+    if support is not None and (drive.motions or drive.failures):  # else nothing was asked of the corners
+        found.append(("the overlap of images", *_overlap(support)))
     if needs_road and steps >= _LEAST:
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
@@ -149,35 +172,63 @@ def of_images(
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
     agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]
-    if odometry.focal_length.error is not None:
-        logarithm, sigma = odometry.focal_length.error
-        figure = f"corners show {100 * np.exp(logarithm):.0f} % of it, with a sigma of {100 * sigma:.0f} %"
-        sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
-        agreements.append(Agreement("the focal length", sigmas, figure))
+    by_corners = of_focal_length(odometry.focal_length, camera)
+    agreements += [] if by_corners is None else [by_corners]
     return [agreements[0], *(each.said() for each in agreements[1:])]  # gaps and segments were said by their frames
 
 
-def frame_support(frames: range, motions: Iterable[Motion], located: Collection[int]) -> FloatArray:
-    """The support of the motion to each frame ``(N,)``, 0 without one; the first has that of the next.
+def _overlap(support: FloatArray) -> tuple[float, str]:
+    """Sigmas and figure of the support of all frames ``(N,)``; many weak frames in a row are a doubt of their own."""
+    mean = float(support.mean())
+    sigmas = max((_USUAL_SUPPORT - mean) / _SUPPORT_SPREAD, 0.0)
+    figure = f"{100 * mean:.0f} % of the corners fit in the next image"
+    weak = runs(np.flatnonzero(support < _WEAK_SUPPORT).tolist())
+    if long := [f"{first} to {last}" for first, last in weak if last - first + 1 >= _LEAST_WEAK]:
+        figure += f", of frames {', '.join(long)} less than {100 * _WEAK_SUPPORT:.0f} %"
+        sigmas = max(sigmas, _CAPPED)
+    return sigmas, figure
 
-    Frames ``located`` in a map have the usual one, as a first frame without a next.
-    """
-    found = dict.fromkeys(located, USUAL_SUPPORT)
+
+def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
+    """By the focal length that corners show; None where they show too little. A guess is a doubt in any case."""
+    logarithm, sigma = found.error or (0.0, np.inf)
+    sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
+    figure = "nobody calibrated it" if camera.is_guess else ""
+    if sigma < _TELLING_FOCAL or sigmas > DOUBTFUL:
+        figure += f"{', ' if figure else ''}corners show {100 * np.exp(logarithm):.0f} % of it"
+        figure += f", with a sigma of {100 * sigma:.0f} %"
+        if sigmas > DOUBTFUL:
+            fov = 2.0 * np.arctan(camera.width / (2.0 * camera.fx * np.exp(logarithm)))
+            figure += f": try fov={np.rad2deg(fov):.0f}"
+    if camera.is_guess:
+        return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
+    return Agreement("the focal length", sigmas, figure) if figure else None
+
+
+def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
+    """The share of the corners that fit the motion to each frame ``(N,)``, 0 without one; the first has the next's."""
+    found: dict[int, float] = {}
     for motion in motions:
         found[motion.ends[1]] = max(found.get(motion.ends[1], 0.0), motion.support)
-    found[0] = found.get(1, 0.0) if len(frames) > 1 else USUAL_SUPPORT
+    found[0] = found.get(1, 0.0)
     return np.array([found.get(frame, 0.0) for frame in frames])
 
 
-def confidence(agreements: Iterable[Agreement]) -> float:
-    """The share of drives with as large a contradiction that err by at most 1 % of their path."""
-    return float(np.interp(max((each.sigmas for each in agreements), default=0.0), _SIGMAS, _CONFIDENCE))
+def confidence(agreements: Iterable[Agreement], is_metric: bool, is_carried: bool) -> float | MeasurementFailure:
+    """The share of drives with as large a contradiction that err by at most 1 % of their path; where known of such."""
+    if is_carried:
+        return MeasurementFailure("it is calibrated on roads, not for a camera that is carried")
+    if not is_metric:
+        return MeasurementFailure("it is calibrated for lengths in metres")
+    return float(share_right(max((each.sigmas for each in agreements), default=0.0), CONFIDENCE))
 
 
-def confidence_of_frames(support: FloatArray) -> FloatArray:
-    """The same for every frame ``(N,)``, by its support alone."""
-    return np.interp(_support_sigmas(support), _SIGMAS, _CONFIDENCE)
+def share_right(sigmas: FloatArray | float, constants: tuple[float, float, float]) -> FloatArray:
+    """The share of drives that err by at most 1 % of their path, by their largest contradiction ``(N,)``.
 
-
-def _support_sigmas(support: FloatArray | float) -> FloatArray:
-    return np.maximum((USUAL_SUPPORT - np.asarray(support)) / _SUPPORT_SPREAD, 0.0)
+    Args:
+        sigmas: of the contradictions.
+        constants: the best share, the sigmas that halve it, and how steeply it falls.
+    """
+    best, half, steepness = constants
+    return np.asarray(best / (1.0 + (np.maximum(sigmas, 0.0) / half) ** steepness))

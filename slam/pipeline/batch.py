@@ -168,9 +168,13 @@ class SlamPipeline:
         if self._positioning is not None and self._positioning.agreement is not None:
             by_gps = self._positioning.agreement
             by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
-        support = agreement.frame_support(range(len(drive)), drive.motions, drive.map_poses.segments)
+        support = None if drive.maps else agreement.frame_support(range(len(drive)), drive.motions)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
-        of_images = agreement.of_images(drive, state.odometry, support, scale.contradicted, needs_road)
+        camera = self._sequence.intrinsics
+        of_images = agreement.of_images(drive, state.odometry, camera, support, scale.contradicted, needs_road)
+        if not drive.maps:
+            of_images.append(agreement.of_directions(odometry.T_world_camera))
+        trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]
         return Estimate(
             network=self._trajectory(odometry.T_network),
             odometry=self._trajectory(odometry.T_world_camera),
@@ -188,7 +192,7 @@ class SlamPipeline:
             first=self.first,
             stopwatch=self._watch,
             agreements=(*by_sources, *of_images),
-            confidence=agreement.confidence([*(each for each in by_sources if not each.is_wrong), *of_images]),
+            confidence=agreement.confidence(trusted, scale.is_metric, bool(drive.maps)),
             support=support,
         )
 

@@ -32,8 +32,8 @@ class Estimate:
     ``state`` is that of the front end, for a run that continues this one; frames before ``first`` are of earlier runs.
     ``graph`` is the reason where it has no solution: the optimised trajectory then is the odometry.
     ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
-    each optional source contradicts the images, ``confidence`` what follows from
-    all of them; ``support`` ``(N,)`` is that of the motion to each frame.
+    each optional source contradicts the images, ``confidence`` what follows from all of them, or why nothing does;
+    ``support`` ``(N,)`` is that of the motion to each frame, None where maps of keyframes give the poses.
     """
 
     network: Trajectory
@@ -51,8 +51,8 @@ class Estimate:
     location: Location | MeasurementFailure | None
     first: int
     stopwatch: Stopwatch
-    confidence: float
-    support: FloatArray
+    confidence: float | MeasurementFailure
+    support: FloatArray | None
     agreements: tuple[Agreement, ...] = ()
     map: TsdfMap | None = None
 

@@ -94,7 +94,7 @@ class Slam:
         self._is_closed = False
         self._poses = LivePoses(predictor.sources, camera_height_m, config, update=update_frames)
         self._sweep_frames = sweep_frames
-        self._newest = LivePose(0, np.eye(4), "starting", None, 0.0)
+        self._newest = LivePose(0, np.eye(4), "starting", None, None)
         self._estimate: Estimate | None = None
 
     @classmethod

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from slam.config.sections import SlamConfig
-from slam.frontend.agreement import confidence_of_frames, frame_support
+from slam.frontend.agreement import frame_support
 from slam.frontend.factors import chain_odometry, scaled_steps
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.scale.metric_scale import Scale, find_scale
@@ -24,14 +24,15 @@ State = Literal["starting", "tracking", "bridged", "relocalised"]
 class LivePose:
     """A frame's pose ``(4, 4)``; ``unit`` is that of the pose over that of learned depth, None while unknown.
 
-    ``confidence`` is that of the frame, by its corners (`confidence_of_frames`).
+    ``support`` is the share of the corners that fit the motion to it; None of the first frame, and where a map of
+    keyframes gives the pose.
     """
 
     frame: int
     T_world_camera: FloatArray
     state: State
     unit: float | None
-    confidence: float
+    support: float | None
 
 
 class LivePoses:
@@ -87,14 +88,14 @@ class LivePoses:
         drive = observer.drive
         first, count = len(self._T_world_camera), len(drive)
         frames = range(first, count)
-        located = [index for index in frames if self._step(observer, index)]
+        unasked = {0, *(index for index in frames if self._step(observer, index))}
         if drive.snippets and (self._unit is None or count // self._update > first // self._update):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        support = frame_support(frames, drive.motions[-_LAST_STEPS * len(frames) :], located)
+        support = frame_support(frames, drive.motions[-_LAST_STEPS * len(frames) :]).tolist()
         return [
-            LivePose(k, self._T_world_camera[k].copy(), self._state(k in drive.unusable), unit, confidence)
-            for k, confidence in zip(frames, confidence_of_frames(support).tolist())
+            LivePose(k, pose.copy(), self._state(k in drive.unusable), unit, None if k in unasked else share)
+            for k, pose, share in zip(frames, self._T_world_camera[first:], support)
         ]
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:

@@ -17,7 +17,6 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence, runs
-from slam.frontend.agreement import confidence_of_frames
 from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
@@ -48,6 +47,7 @@ from slam.runtime.timing import Stopwatch, peak_rss_mb
 from slam.sequences.continued import unused_scans
 
 _NO_TRUTH = Missing("the sequence has no true poses")
+_BY_MAPS = Missing("maps of keyframes give the poses, not steps from frame to frame")
 _NO_MAP_YET = Missing("the run ended before its map was whole")
 
 
@@ -55,6 +55,7 @@ def estimate_metrics(
     result: Estimate, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
 ) -> Metrics:
     """All metrics before the map is fused."""
+    sure = result.confidence
     return Metrics(
         schema_=1,
         status="estimated",
@@ -64,9 +65,8 @@ def estimate_metrics(
         timing=timing_of(result.stopwatch, len(sequence) - result.first),
         scale=_scale(result),
         agreement=[AgreementMetrics(**asdict(each)) for each in result.agreements],
-        confidence=ConfidenceMetrics(
-            run=result.confidence, frames=confidence_of_frames(result.support).round(2).tolist()
-        ),
+        confidence=ConfidenceMetrics(run=sure if isinstance(sure, float) else Missing(sure.reason)),
+        support=_BY_MAPS if result.support is None else result.support.round(2).tolist(),
         trajectories=Trajectories(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),

@@ -100,10 +100,9 @@ class AgreementMetrics(Record):
 
 
 class ConfidenceMetrics(Record):
-    """Share of drives of this kind that err by at most 1 % of their path; of the run and of each frame."""
+    """Share of drives of this kind that err by at most 1 % of their path."""
 
     run: Known[float] = MISSING
-    frames: Known[list[float]] = MISSING
 
 
 class Trajectories(Record):
@@ -263,6 +262,7 @@ class Metrics(Record):
     scale: Known[ScaleMetrics] = MISSING
     agreement: Known[list[AgreementMetrics]] = MISSING
     confidence: Known[ConfidenceMetrics] = MISSING
+    support: Known[list[float]] = MISSING
     trajectories: Known[Trajectories] = MISSING
     gps: Known[GpsMetrics] = MISSING
     graph: Known[GraphMetrics] = MISSING

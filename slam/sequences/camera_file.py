@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
 from erfsfm.common.readers.pinhole import Pinhole
+from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.sequences.foreign_camera import read_foreign_camera
 
@@ -126,6 +127,11 @@ def mount_beside(pinhole: Pinhole, usual_m: float | None, *folders: Path) -> tup
     """
     found = beside(*folders, own={**asdict(pinhole), "fps": DEFAULT_FPS})
     return (usual_m, 0.0) if found is None else (found.height_or(usual_m), found.readout_ms / 1e3)
+
+
+def as_known(intrinsics: Intrinsics, asked: Path | None) -> Intrinsics:
+    """The same camera; a guess where the user gave a field of view alone."""
+    return replace(intrinsics, is_guess=asked is not None and is_field_of_view(asked))
 
 
 def is_field_of_view(given: Path) -> bool:

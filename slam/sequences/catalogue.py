@@ -15,6 +15,7 @@ from slam.frames import Sequence
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.runtime.imports import import_plug_in, plug_ins
 from slam.sequences import euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
+from slam.sequences.camera_file import as_known
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
@@ -24,7 +25,7 @@ from slam.sequences.truth import take_truth
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
 KITTI_NAME = "KITTI"
-EMBEDDED_SEED = 1000
+EMBEDDED_SEED = 640  # no weights saw it
 EMBEDDED_FRAMES = 320
 
 PLUG_INS = "erfsfm_slam.sequences"  # entry points of other packages: each names a `Loader`
@@ -86,6 +87,7 @@ def open_sequence(
     else:
         root = _root(dataset, name)
         sequence = _choose(root, Asked(name, camera))
+        sequence.intrinsics = as_known(sequence.intrinsics, camera)
     if truth is not None:
         take_truth(sequence, truth)
     if frames is None:

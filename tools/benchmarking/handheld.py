@@ -140,7 +140,7 @@ def longest_wait(o: JobResult) -> int | Missing:
 
 ATE = MetricDefinition("ate_7dof_known_m", "ATE 7-dof (m)", _ate, 3)
 PATH = MetricDefinition("path_known_m", "path (m)", _path, 1)
-PERCENT = MetricDefinition("ate_7dof_known_percent", "% of path", lambda o: ratio(_ate(o), _path(o), 100.0), 2)
+PERCENT = MetricDefinition("ate_7dof_known_percent", "7-dof, % of path", lambda o: ratio(_ate(o), _path(o), 100.0), 2)
 LOSSES = MetricDefinition("losses", "losses", losses, 0)
 FIRST_MAP = MetricDefinition("frames_before_first_map", "frames before the first map", first_map, 0)
 NEW_MAP = MetricDefinition("frames_before_new_map", "most frames before a new map", longest_wait, 0)

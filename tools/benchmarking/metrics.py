@@ -9,7 +9,7 @@ from statistics import fmean, median, stdev
 from typing import Any
 
 from benchmarking.plan import slug
-from benchmarking.work import JobResult
+from benchmarking.work import JobResult, ratio
 from shared.command import markdown
 
 from slam.results.error_columns import DASH
@@ -56,7 +56,10 @@ _R_REL, _SCALE = (
 )
 R_REL = MetricDefinition("r_rel_deg_per_100m", "r_rel (deg / 100 m)", _R_REL, 2)
 SCALE = MetricDefinition("scale", "scale", _SCALE, 3)
-PERCENT = MetricDefinition("ate_7dof_optimised_percent", "% of path", lambda o: o.derived.optimised_percent, 2)
+PERCENT = MetricDefinition("ate_7dof_optimised_percent", "7-dof, % of path", lambda o: o.derived.optimised_percent, 2)
+PERCENT_6 = MetricDefinition(
+    "ate_6dof_optimised_percent", "6-dof, % of path", lambda o: ratio(ATE_6.value(o), LENGTH.value(o), 100.0), 2
+)
 NETWORK_PERCENT = MetricDefinition(
     "ate_7dof_network_percent", "network, % of path", lambda o: o.derived.network_percent, 2
 )
@@ -93,7 +96,7 @@ COMMAND = MetricDefinition("command_seconds", "whole command (s)", lambda o: o.p
 LOAD = MetricDefinition("load_average", "load before", lambda o: o.process.load, 1)
 TIME = MetricDefinition("ms_per_frame", "ms / frame", lambda o: o.process.ms_per_frame, 1)
 CPU = MetricDefinition("cpu_ms_per_frame", "CPU ms / frame", lambda o: o.process.cpu_ms_per_frame, 1)
-DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
+DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
 DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, TRIANGLES)
 DEFINITIONS += (*MAP_ERRORS, *MAP_SIZES[1:], FUSION, MESH)
 DEFINITIONS += (RATE, MEMORY, SECONDS, TIME, CPU, COMMAND, LOAD)

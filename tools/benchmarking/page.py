@@ -48,7 +48,7 @@ def accuracy_tables(results: Sequence[JobResult]) -> str:
 
 def error_tables(results: Sequence[JobResult], picture: str = "") -> str:
     """One row for each kind of drive, then one for each sequence and weights."""
-    definitions = (m.FRAMES, m.LENGTH, *m.ERRORS, m.PERCENT, m.OF_NETWORK, m.R_REL, m.SCALE)
+    definitions = (m.FRAMES, m.LENGTH, *m.ERRORS, m.PERCENT, m.PERCENT_6, m.OF_NETWORK, m.R_REL, m.SCALE)
     definitions += (m.LOOPS, m.FALSE_LOOPS, m.COVERAGE, m.RATE, m.MEMORY)
     columns = {q.title: over_seeds(q) for q in definitions}
     return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
@@ -117,7 +117,7 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
         "runs": lambda group: str(len(group)),
         "failed": lambda group: str(sum(bool(o.reason) for o in group)),
         "mean ATE 7-dof (m)": m.average(handheld.ATE),
-        "ATE, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
+        "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
         "losses in all": lambda group: f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH,
         "frames before the first map": m.middle_and_extreme(handheld.FIRST_MAP, max),
         "before a new map": m.middle_and_extreme(handheld.NEW_MAP, max),
@@ -218,7 +218,8 @@ def summary_table(results: Sequence[JobResult]) -> str:
     columns: dict[str, Cell] = {
         "runs": lambda group: str(len(group)),
         "failed": lambda group: str(sum(bool(o.reason) for o in group)),
-        "ATE, % of path: median (worst)": m.middle_and_extreme(m.PERCENT, max),
+        "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(m.PERCENT, max),
+        "ATE 6-dof, % of path": m.middle_and_extreme(m.PERCENT_6, max),
         "the network's": m.middle_and_extreme(m.NETWORK_PERCENT, max),
         "over the network's": m.middle_and_extreme(m.OF_NETWORK, max),
         "over the clean drive's": against_clean(results),

@@ -15,8 +15,9 @@ Emit = Callable[[dict[str, Any]], None]
 def pose_message(index: int, stamp: float, newest: LivePose, unit: str | None) -> dict[str, Any]:
     """One frame: its pose ``(4, 4)`` as 12 numbers, row by row as in KITTI's files."""
     pose = [float(x) for x in newest.T_world_camera[:3].ravel()]
-    scale = {"unit": unit, "scale": newest.unit, "confidence": round(newest.confidence, 2)}
-    return {"type": "pose", "frame": index, "stamp": stamp, "state": newest.state, **scale, "T_world_camera": pose}
+    support = None if newest.support is None else round(newest.support, 2)
+    known = {"unit": unit, "scale": newest.unit, "support": support}
+    return {"type": "pose", "frame": index, "stamp": stamp, "state": newest.state, **known, "T_world_camera": pose}
 
 
 def corrected_message(trajectory: Trajectory, loops: int, unit: str | None, run: str) -> dict[str, Any]:

@@ -38,6 +38,7 @@ from slam.results.output_folder import check_output
 from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
+from slam.sequences.camera_file import as_known
 from slam.sequences.growing import GrowingSequence
 from slam.sequences.undistortion import intrinsics_of
 
@@ -86,6 +87,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     networks.depth(blank)  # both are loaded before images come
     networks.poses([blank] * (networks.sources + 1))
     sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
+    sequence.intrinsics = as_known(sequence.intrinsics, request.camera_file)
     pipeline = SlamPipeline(sequence, predictor, settings, seed=request.seed)
     poses = LivePoses(predictor.sources, sequence.camera_height_m, settings)
     session = _Session(sequence, poses, emit, Viewer(intrinsics) if request.view else None)

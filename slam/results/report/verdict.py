@@ -20,6 +20,7 @@ _WIDE_SPREAD = 0.15  # of the scale
 _LARGEST_SCALE_ERROR = 0.03
 _SURE = 0.5
 _NOISE_POINTS = 0.12  # share of factors off the promised one
+_LEAST_FUSED = 0.15  # of the depth of all keyframes: maps of streets and rooms have 0.35 to 0.6
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,8 @@ def _confidence(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     sure = known(metrics.confidence.run)
     if sure is not None:
         yield sure > _SURE, f"{percent(sure)} of drives with images like its own err by at most 1 % of their path"
+    elif isinstance(metrics.confidence.run, Missing) and not isinstance(metrics.confidence, Missing):
+        yield False, f"nobody knows how sure it is: {metrics.confidence.run.reason}"
 
 
 def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
@@ -129,13 +132,18 @@ def _frames(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     if (maps := known(metrics.tracking.maps) or 1) > 1:
         yield False, f"tracking was lost: {maps} maps are not joined"
     if metrics.provenance.leak is True:
-        yield False, "its weights saw this sequence, or a part of it, in training"
+        yield False, "LEAK: its weights saw this sequence, or a part of it, in training"
 
 
 def _map(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     off = known(metrics.map.accuracy_median_m)
     if off is not None:
         yield True, f"its map lies {off:.2g} m (median) from the true surface"
+    frames, filters = known(metrics.map.frames_fused), known(metrics.map.filters)
+    if frames and filters:
+        fused = (1.0 - sum(filters.values())) * frames / (frames + (known(metrics.map.frames_left_out) or 0))
+        if fused < _LEAST_FUSED:
+            yield False, f"{percent(1.0 - fused)} of the depth of its keyframes was thrown away before the map"
 
 
 def _count(number: int, noun: str) -> str:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from erfsfm.common.command_line import Terminal
-from slam.frames import RelativePose
+from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
@@ -25,6 +27,7 @@ from slam.frontend.visual.tracking import CornerTrackerState
 from slam.geometry import se3
 
 FRAMES = 40
+CAMERA = Intrinsics(416, 128, 240.0, 240.0, 207.5, 63.5)
 TURNS = np.column_stack([np.zeros(FRAMES), np.full(FRAMES, 0.02), np.zeros(FRAMES)])
 STEPS = se3.from_rotation_vector(TURNS, np.tile([0.0, 0.0, 0.9], (FRAMES, 1)))
 SWAPPED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -73,31 +76,73 @@ def test_disparity_that_is_read_as_depth_is_doubtful() -> None:
 
 
 def driven(
-    support: float = 0.7, on_road: int = FRAMES, segments: int = 1, contradicted: int = 0, focal: float = 0.0
+    support: float = 0.7,
+    on_road: int = FRAMES,
+    segments: int = 1,
+    contradicted: int = 0,
+    focal: float = 0.0,
+    aside: int = 0,
+    weak: int = 0,
+    is_guess: bool = False,
 ) -> float:
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
     drive = Drive(
-        motions=[Motion(pose, 1e-4 * np.eye(6), support=support) for pose in poses],
+        motions=[Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support) for k, pose in enumerate(poses)],
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
         roads=[MeasurementFailure("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
     )
     tracker, mask = CornerTrackerState({}), DynamicMask.empty(416, 128, 1.0)
-    camera = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
-    by_frame = agreement.frame_support(range(len(drive)), drive.motions, ())
-    return agreement.confidence(
-        agreement.of_images(drive, camera, by_frame, [pose.ends for pose in poses[:contradicted]], needs_road=True)
-    )
+    state = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
+    camera = replace(CAMERA, is_guess=is_guess)
+    by_frame = agreement.frame_support(range(len(drive)), drive.motions)
+    ends = [pose.ends for pose in poses[:contradicted]]
+    found = agreement.of_images(drive, state, camera, by_frame, ends, needs_road=True)
+    steps = STEPS.copy()
+    steps[:aside, :3, 3] = [0.9, 0.0, 0.0]
+    sure = agreement.confidence([*found, agreement.of_directions(se3.chain(steps))], is_metric=True, is_carried=False)
+    assert isinstance(sure, float)
+    return sure
 
 
 @pytest.mark.parametrize(
     "doubtful",
-    [{"support": 0.2}, {"on_road": 10}, {"segments": 2}, {"contradicted": 2}, {"focal": np.log(1.3)}],
+    [
+        {"support": 0.2},
+        {"on_road": 10},
+        {"segments": 2},
+        {"contradicted": 2},
+        {"focal": np.log(1.3)},
+        {"aside": 8},
+        {"weak": 10},
+        {"is_guess": True},
+    ],
     ids=str,
 )
-def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, float]) -> None:
-    assert driven(**doubtful) < 0.5 < 0.9 < driven()
+def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, Any]) -> None:
+    assert driven(**doubtful) < 0.5 < 0.9 < driven(weak=8)
+
+
+def test_a_guessed_focal_length_comes_with_the_one_that_corners_show() -> None:
+    sigma = 0.02
+    information = (4.0 / sigma) ** 2
+    found = FocalLength(information, -information * np.log(CAMERA.fx / 300.0))
+    guess = replace(CAMERA, fx=300.0, fy=300.0, is_guess=True)
+    said = agreement.of_focal_length(found, guess)
+    assert said is not None
+    true_fov = np.rad2deg(2 * np.arctan(CAMERA.width / (2 * CAMERA.fx)))
+    assert f"try fov={true_fov:.0f}" in said.figure
+
+
+def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:
+    information = (4.0 / 0.25) ** 2
+    assert agreement.of_focal_length(FocalLength(information, 0.01 * information), CAMERA) is None
+
+
+@pytest.mark.parametrize(("is_metric", "is_carried"), [(False, False), (True, True)])
+def test_without_metres_and_of_a_carried_camera_no_number_is_said(is_metric: bool, is_carried: bool) -> None:
+    assert isinstance(agreement.confidence([], is_metric, is_carried), MeasurementFailure)
 
 
 def test_two_contradictions_are_two_warnings(
@@ -111,7 +156,6 @@ def test_two_contradictions_are_two_warnings(
     assert "lidar contradicts" in (said := capsys.readouterr().err) and "GPS contradicts" in said
 
 
-def test_a_frame_without_a_motion_has_no_confidence() -> None:
+def test_a_frame_without_a_motion_has_no_support() -> None:
     motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
-    found = agreement.confidence_of_frames(agreement.frame_support(range(4), motions, {3}))
-    assert found[0] == found[1] == found[3] > 0.9 > 0.2 > found[2]
+    assert agreement.frame_support(range(3), motions).tolist() == [0.7, 0.7, 0.0]

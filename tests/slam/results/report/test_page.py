@@ -147,6 +147,10 @@ def test_the_first_sentence_says_how_good_it_is_and_why(make_run: MakeRun, make_
     unknown = said(**make_metrics(reference=False, mode="none"), confidence={"run": 0.97})
     assert "its error is unknown: 97 % of drives like it err by at most 1 % of their path" in unknown
     assert "and 1 of 3 measured loops agree and close it; its lengths" in unknown
+    unsaid = said(confidence={"run": None, "run_reason": "the camera is carried"})
+    assert "the camera is carried" in unsaid and "of drives" not in unsaid
+    thin = make_metrics()["map"] | {"frames_fused": 4, "frames_left_out": 96, "filters": {"sky": 0.0}}
+    assert "96 % of the depth of its keyframes was thrown away" in said(map=thin)
 
 
 def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None:

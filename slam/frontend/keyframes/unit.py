@@ -6,10 +6,12 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
 
 _LEAST_DEPTHS = 20
-_LEARNED = 0.3 * np.sqrt(2 * 10)  # sigma of the logarithm of learned depth's unit, one error for some ten keyframes
+_SHARED = 10  # keyframes that share an error of learned depth
+_SIGMA, _LEAST_SIGMA = 0.3, 0.05  # of the logarithm of the unit of an image's learned depth, where it is not measured
 
 
 def learned_unit(local: LocalMap) -> float:
@@ -27,9 +29,9 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
         carried: sigmas of the logarithm of the unit from each keyframe to the next ``(K - 1,)``, a random walk.
     """
     own = np.array([_logarithm(local, keyframe) for keyframe in local.keyframes])
-    weight = np.where(np.isfinite(own), _LEARNED**-2.0, 0.0)
-    if not weight.any():
+    if not np.isfinite(own).any():
         return np.ones(len(own)), np.ones(len(own))
+    weight = np.where(np.isfinite(own), 0.5 / _SHARED / _scatter(own) ** 2, 0.0)
     own = np.nan_to_num(own)
     system = np.zeros((2, len(own)))
     system[1] = weight
@@ -44,3 +46,12 @@ def _logarithm(local: LocalMap, keyframe: TrackedKeyframe) -> float:
     ratios = local.ratios(keyframe)
     known = ratios[ratios > 0.0]
     return -float(np.median(np.log(known))) if len(known) >= _LEAST_DEPTHS else np.nan
+
+
+def _scatter(logarithms: FloatArray) -> float:
+    """Of the units of learned depth about that of the map, by keyframes that share no error."""
+    apart = logarithms[_SHARED:] - logarithms[:-_SHARED]
+    apart = apart[np.isfinite(apart)]
+    if len(apart) < _SHARED:
+        return _SIGMA
+    return float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA))

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
@@ -16,7 +15,9 @@ def scene() -> FloatArray:
     return np.column_stack([rng.uniform(-2, 2, (TRACKS, 2)), rng.uniform(4, 6, TRACKS)])
 
 
-def seen(index: int, T_world_camera: FloatArray, points: FloatArray, learned_unit: float) -> TrackedKeyframe:
+def seen(
+    index: int, T_world_camera: FloatArray, points: FloatArray, learned_unit: float | FloatArray
+) -> TrackedKeyframe:
     T, nothing = invert(T_world_camera), np.zeros((TRACKS, 32), np.uint8)
     x, y, z = apply(T, points).T
     pixels = np.column_stack([500 * x / z + 319.5, 500 * y / z + 239.5])
@@ -27,16 +28,19 @@ def along(x: float) -> FloatArray:
     return make(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
-@pytest.mark.parametrize(("baseline", "unit"), [(0.5, 1.0), (0.01, 2.0**0.9 / 2.0)])
-def test_new_points_have_the_unit_of_those_with_parallax(baseline: float, unit: float) -> None:
-    """Learned depth is half the depth: without parallax the unit returns to that of learned depth by a tenth."""
+def test_new_points_have_the_unit_of_those_with_parallax() -> None:
+    """Learned depth is half the depth, by most of the known points, whose parallax is small, the whole depth."""
     points = scene()
+    far = np.arange(KNOWN) < 0.6 * KNOWN
+    points[:KNOWN][far] *= 200.0
     local = LocalMap(points=points.copy())
     local.points[KNOWN:] = np.nan
+    learned = np.full(TRACKS, 0.5)
+    learned[:KNOWN][far] = 1.0
     for k in range(3):
-        local.add(seen(k, along(k * baseline), points, 0.5))
+        local.add(seen(k, along(0.5 * k), points, learned))
     local.add_points(CAMERA)
-    in_camera = apply(local.keyframes[-1].T_camera_world, points[KNOWN:]) * unit
+    in_camera = apply(local.keyframes[-1].T_camera_world, points[KNOWN:])
     np.testing.assert_allclose(apply(local.keyframes[-1].T_camera_world, local.points[KNOWN:]), in_camera, rtol=1e-9)
     np.testing.assert_array_equal(local.points[:KNOWN], points[:KNOWN])
 
@@ -62,6 +66,34 @@ def test_points_without_parallax_are_uncertain_along_their_first_ray() -> None:
     # 0.7 pixels over an angle of some ten degrees
     assert np.linalg.norm(np.cross(spread, points), axis=1).max() < 1e-9
     assert (np.linalg.norm(spread, axis=1) < 0.02 * np.linalg.norm(points, axis=1)).all()
+
+
+def unit_after_a_walk(seed: int, keyframes: int = 10) -> float:
+    """Of the last step of a map with half a pixel of noise, whose learned depth is 30 % too short in all images.
+
+    Points have between 0.3 and 2 degrees of parallax, and start where two fixed keyframes are and the depth is learned.
+    """
+    rng = np.random.default_rng(seed)
+    step = 0.02
+    angle = np.deg2rad(rng.uniform(0.3, 2.0, TRACKS))
+    z = keyframes * step / angle
+    points = np.column_stack([z[:, None] * rng.uniform(-0.4, 0.4, (TRACKS, 2)), z])
+    local = LocalMap(points=0.9 * points)
+    for k in range(keyframes):
+        keyframe = seen(k, along(step * k), points, 0.7 * np.exp(rng.normal(0.0, 0.1, TRACKS)))
+        keyframe.pixels[:] += rng.normal(0.0, 0.5, (TRACKS, 2))
+        local.add(keyframe)
+    for k in range(2, keyframes):
+        few = LocalMap(local.keyframes[: k + 1], local.points)
+        few.adjust(CAMERA)
+        local.keyframes[: k + 1], local.points = few.keyframes, few.points
+    centres = invert(np.array([keyframe.T_camera_world for keyframe in local.keyframes]))[:, :3, 3]
+    return float(np.linalg.norm(centres[-1] - centres[-2])) / step
+
+
+def test_learned_depth_does_not_move_the_unit_of_a_map() -> None:
+    units = np.log([unit_after_a_walk(seed) for seed in range(20)])
+    assert abs(units.mean()) < 0.1
 
 
 def test_adjustment_takes_the_unit_of_loose_points_from_themselves() -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import coloured_ply
 
-from slam.formats.ply import coloured_ply, read_ply, write_ply
+from slam.formats.ply import read_ply, write_ply
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 

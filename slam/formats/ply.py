@@ -115,25 +115,6 @@ def map_ply(path: Path) -> tuple[NDArray[np.void], NDArray[np.void]]:
         raise RunError(f"{path} is no mesh that can be read ({reason}): run the sequence again") from error
 
 
-def coloured_ply(
-    points: FloatArray, normals: FloatArray, colours: FloatArray, triangles: NDArray[np.int64] | None = None
-) -> Ply:
-    """A cloud or a mesh.
-
-    Args:
-        points: ``(P, 3)``.
-        normals: ``(P, 3)`` of length 1.
-        colours: RGB ``(P, 3)``, clipped to [0, 1].
-        triangles: ``(T, 3)`` indices of points; None for a cloud.
-    """
-    kinds = [*((name, "<f8") for name in (*_AXES, *_NORMALS)), *((name, "u1") for name in _COLOURS)]
-    vertices = np.empty(len(points), dtype=kinds)
-    whole = np.hstack([points, normals, np.rint(np.clip(colours, 0, 1) * 255)])
-    for name, column in zip((*_AXES, *_NORMALS, *_COLOURS), whole.T, strict=True):
-        vertices[name] = column
-    return Ply(vertices, triangles)
-
-
 def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
     """The same with vertices and normals rotated by ``R_up_world`` ``(3, 3)``."""
     vertices = ply.vertices.copy()

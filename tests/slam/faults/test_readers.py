@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from meshes import coloured_ply
 
 from erfsfm.checkpoint import load_model
 from erfsfm.common.readers.camera_file import read_camera_file
@@ -27,7 +28,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import read_split_file
 from slam import run_slam
 from slam.config.sections import load_config
-from slam.formats.ply import coloured_ply, read_ply, write_ply
+from slam.formats.ply import read_ply, write_ply
 from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.geometry import se3
 from slam.loops.places import Places

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import coloured_ply
 
-from slam.formats.ply import coloured_ply, read_ply, write_ply
+from slam.formats.ply import read_ply, write_ply
 from slam.runtime.imports import import_open3d
 
 POINTS = np.array([[0.0, 0.5, 1.0], [1.25, -2.0, 3.0]])

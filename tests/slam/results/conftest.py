@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from meshes import coloured_ply
 
-from slam.formats.ply import Ply, coloured_ply, write_ply
+from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.report.map_view import MapView, map_view

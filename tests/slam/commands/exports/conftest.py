@@ -9,8 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from meshes import coloured_ply
 
-from slam.formats.ply import Ply, coloured_ply
+from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector

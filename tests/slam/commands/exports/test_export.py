@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from meshes import coloured_ply
 
 from slam.commands.exports.export import export
 from slam.commands.exports.parts import R_UP_WORLDS
-from slam.formats.ply import Ply, coloured_ply, read_ply, write_ply
+from slam.formats.ply import Ply, read_ply, write_ply
 from slam.frames import Intrinsics
 from slam.loops.places import Places
 from slam.results.folder import RunFolder

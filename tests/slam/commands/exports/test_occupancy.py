@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from meshes import coloured_ply
 
 from slam.commands.cli import app
 from slam.commands.exports.export import export
 from slam.commands.exports.ground import ground_along
 from slam.commands.exports.occupancy import occupancy_grid
 from slam.commands.exports.sampling import Grid, samples
-from slam.formats.ply import Ply, coloured_ply
+from slam.formats.ply import Ply
 from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN, write_ros_map
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray

@@ -68,7 +68,7 @@ def resect(
         return int((pose.residual_px[votes] < INLIER_PX).sum())
 
     def is_sure(pose: CameraPose) -> bool:
-        return support(pose) >= _DOUBTFUL_RATIO * votes.sum()
+        return bool(support(pose) >= _DOUBTFUL_RATIO * votes.sum())
 
     best = _refined(guesses[0], points, spread, pixels, intrinsics, votes)
     for guess in guesses[1:]:

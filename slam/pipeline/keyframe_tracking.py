@@ -72,7 +72,8 @@ class KeyframeTracking:
         """
         self._config, self._loops, self._intrinsics, self._seed = config, loops, intrinsics, seed
         self._camera_height_m = camera_height_m
-        self._places: Relocaliser | None = None
+        self._lost: MapSegment | None = None
+        self._places: Relocaliser | None = None  # of the lost map
         self._front_end: FrontEnd = "steps" if state is None else "both"
         self._cores = ExitStack()
         self._odometry: KeyframeOdometry | None = None
@@ -91,9 +92,9 @@ class KeyframeTracking:
             return
         self._odometry.follow(frame)
         lost = self._odometry.lost_map()
-        if lost is None:
-            self._places = None
-        elif self._loops.enabled:
+        if lost is not self._lost:  # a map that begins may be lost with the next frame
+            self._lost, self._places = lost, None
+        if lost is not None and self._loops.enabled:
             self._relocalise(self._odometry, lost.map, frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:

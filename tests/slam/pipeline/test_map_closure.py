@@ -134,8 +134,9 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     [
         ([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 67]),
         pytest.param([*range(61), 68, 60, 8], (60, 62), (61,), [63], marks=pytest.mark.slow),
+        ([*range(70), 40, 41], range(60, 70), (), []),
     ],
-    ids=["relocalised before", "located in a frame without depth before"],
+    ids=["relocalised before", "located in a frame without depth before", "in a map that has just begun"],
 )
 def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
     places: list[int], unseen: Sequence[int], sparse: Sequence[int], relocalised: list[int]

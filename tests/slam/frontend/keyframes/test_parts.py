@@ -98,3 +98,9 @@ def test_a_map_whose_points_carry_the_unit_is_one_part() -> None:
     segment = walked(1.0, learned_sigma=0.3)
     (part,) = parts_of(MapSegment(LocalMap(segment.map.keyframes[:WALK], segment.map.points), started=True), CAMERA)
     assert [keyframe.index for keyframe in part.map.keyframes] == list(range(WALK)) and not part.turns
+
+
+def test_a_map_of_one_keyframe_is_one_part() -> None:
+    segment = walked(1.0, learned_sigma=0.3)
+    alone = MapSegment(LocalMap(segment.map.keyframes[:1], segment.map.points), started=True)
+    assert [len(part.map.keyframes) for part in parts_of(alone, CAMERA)] == [1]

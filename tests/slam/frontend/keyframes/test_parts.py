@@ -89,6 +89,8 @@ def test_keyframes_that_share_no_point_are_in_two_parts() -> None:
     assert after.map.keyframes[0].index == middle + 1  # where points of the keyframe before have parallax
     by_image, by_points = before.turns
     assert by_image.ends == (middle - 1, middle) and by_points.ends == (middle, middle + 1)
+    way = np.linalg.norm(cameras()[middle, :3, 3] - cameras()[middle - 1, :3, 3])
+    assert not by_image.T_from_to[:3, 3].any() and by_image.sigmas[3] > 0.9 * way
     assert by_image.sigmas[0] == pytest.approx(np.deg2rad(0.5)) and by_points.sigmas[0] == pytest.approx(
         np.deg2rad(0.1)
     )

@@ -38,7 +38,7 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
     system[0, 1:] = -(carried**-2.0)
     system[1, 1:] += carried**-2.0
     system[1, :-1] += carried**-2.0
-    walk = np.asarray(solveh_banded(system, weight * own))
+    walk = np.asarray(solveh_banded(system[-len(own) :], weight * own))
     return np.exp(walk), np.exp(np.where(weight > 0.0, walk - own, 0.0))
 
 

@@ -89,6 +89,8 @@ def test_keyframes_that_share_no_point_are_in_two_parts() -> None:
     assert after.map.keyframes[0].index == middle + 1  # where points of the keyframe before have parallax
     by_image, by_points = before.turns
     assert by_image.ends == (middle - 1, middle) and by_points.ends == (middle, middle + 1)
+    way = np.linalg.norm(cameras()[middle, :3, 3] - cameras()[middle - 1, :3, 3])
+    assert not by_image.T_from_to[:3, 3].any() and by_image.sigmas[3] > 0.9 * way
     assert by_image.sigmas[0] == pytest.approx(np.deg2rad(0.5)) and by_points.sigmas[0] == pytest.approx(
         np.deg2rad(0.1)
     )
@@ -98,3 +100,9 @@ def test_a_map_whose_points_carry_the_unit_is_one_part() -> None:
     segment = walked(1.0, learned_sigma=0.3)
     (part,) = parts_of(MapSegment(LocalMap(segment.map.keyframes[:WALK], segment.map.points), started=True), CAMERA)
     assert [keyframe.index for keyframe in part.map.keyframes] == list(range(WALK)) and not part.turns
+
+
+def test_a_map_of_one_keyframe_is_one_part() -> None:
+    segment = walked(1.0, learned_sigma=0.3)
+    alone = MapSegment(LocalMap(segment.map.keyframes[:1], segment.map.points), started=True)
+    assert [len(part.map.keyframes) for part in parts_of(alone, CAMERA)] == [1]

@@ -23,6 +23,7 @@ _CONVERGED = 5e-5
 _LEAST_PIXEL_SIGMA = 0.1
 # below this inlier ratio the pose may be one that some wrong tracks agree on
 _DOUBTFUL_RATIO = 0.75
+_CLEARLY = 2.0  # times the support of the pose by all points, of that by trusted ones in its place
 _SAMPLES = 300
 _PIXEL_SIGMA = Noise().pixel  # of a sighting
 
@@ -47,7 +48,7 @@ def resect(
     intrinsics: Intrinsics,
     seed: int = 0,
     spread: FloatArray | None = None,
-    votes: NDArray[np.bool_] | None = None,
+    trusted: NDArray[np.bool_] | None = None,
 ) -> CameraPose:
     """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
 
@@ -60,26 +61,47 @@ def resect(
         intrinsics: of the camera.
         seed: of RANSAC.
         spread: one sigma of each point ``(M, 3)``, in the direction in which it is uncertain; None for exact points.
-        votes: the points ``(M,)`` by which alone the pose is found; None for all.
+        trusted: points ``(M,)`` that fitted the last image; where most of them contradict the pose by all points, and
+            have one of their own, something passes before the camera, and theirs is taken.
     """
-    votes = np.ones(len(points), np.bool_) if votes is None else votes
+    everything = np.ones(len(points), np.bool_)
+    best = _best(guesses, points, pixels, intrinsics, seed, spread, everything)
+    if trusted is not None and _support(best, trusted) < _DOUBTFUL_RATIO * trusted.sum():
+        by_trusted = _best(guesses, points, pixels, intrinsics, seed, spread, trusted)
+        best = by_trusted if _support(by_trusted, trusted) > _CLEARLY * _support(best, trusted) else best
+    return best
 
-    def support(pose: CameraPose) -> int:
-        return int((pose.residual_px[votes] < INLIER_PX).sum())
+
+def _support(pose: CameraPose, votes: NDArray[np.bool_]) -> int:
+    return int((pose.residual_px[votes] < INLIER_PX).sum())
+
+
+def _best(
+    guesses: Sequence[FloatArray],
+    points: FloatArray,
+    pixels: FloatArray,
+    intrinsics: Intrinsics,
+    seed: int,
+    spread: FloatArray | None,
+    votes: NDArray[np.bool_],
+) -> CameraPose:
+    """The pose by the points that vote ``(M,)``."""
 
     def is_sure(pose: CameraPose) -> bool:
-        return bool(support(pose) >= _DOUBTFUL_RATIO * votes.sum())
+        return bool(_support(pose, votes) >= _DOUBTFUL_RATIO * votes.sum())
 
     best = _refined(guesses[0], points, spread, pixels, intrinsics, votes)
     for guess in guesses[1:]:
         if is_sure(best):
             break
-        best = max(best, _refined(guess, points, spread, pixels, intrinsics, votes), key=support)
+        other = _refined(guess, points, spread, pixels, intrinsics, votes)
+        best = max(best, other, key=lambda pose: _support(pose, votes))
     if not is_sure(best):
         found = consensus(points[votes], pixels[votes], intrinsics.K, _SAMPLES, INLIER_PX, seed)
         if found is not None:
             start = make(rotation_matrix(found[0]), found[1])
-            best = max(best, _refined(start, points, spread, pixels, intrinsics, votes), key=support)
+            other = _refined(start, points, spread, pixels, intrinsics, votes)
+            best = max(best, other, key=lambda pose: _support(pose, votes))
     return best
 
 

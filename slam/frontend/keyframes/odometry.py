@@ -251,9 +251,9 @@ class KeyframeOdometry:
         if self._spread is None:
             self._spread = segment.map.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.map.keyframes[-1].track_ids, track_ids)]
-        votes = np.isin(track_ids, segment.frames[-1].track_ids) if segment.frames else np.zeros(0, np.bool_)
-        votes = votes if votes.sum() >= MIN_POINTS else np.ones(len(track_ids), np.bool_)
-        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread, votes)
+        before = np.isin(track_ids, segment.frames[-1].track_ids) if segment.frames else np.zeros(0, np.bool_)
+        trusted = before if before.sum() >= MIN_POINTS else None
+        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread, trusted)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
     def _check_first_motion(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> None:

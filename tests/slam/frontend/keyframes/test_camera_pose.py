@@ -91,10 +91,10 @@ def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_ste
 
 def test_the_majority_is_not_the_world_where_others_have_the_vote() -> None:
     points, pixels = seen(200)
-    votes = np.arange(200) < 50
+    trusted = np.arange(200) < 50
     T_moved = from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.1, 0.0, 0.0])) @ T_TRUE
     moved = apply(T_moved, points) @ INTRINSICS.K.T
-    pixels[~votes] = (moved[:, :2] / moved[:, 2:])[~votes]
-    pose = resect((T_TRUE, T_moved), points, pixels, INTRINSICS, votes=votes)
+    pixels[~trusted] = (moved[:, :2] / moved[:, 2:])[~trusted]
+    pose = resect((T_TRUE, T_moved), points, pixels, INTRINSICS, trusted=trusted)
     np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-6)
-    assert (pose.residual_px[~votes] > 3.0).all()
+    assert (pose.residual_px[~trusted] > 3.0).all()

@@ -28,6 +28,7 @@ _INDEPENDENT = 10  # points with independent errors that those of a keyframe are
 # sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and between two of one part
 _BEGUN, _CARRIED = 0.03, 0.05
 _TURNED, _UNKNOWN = 0.05, 0.5  # the most by points without parallax, and where keyframes share few points
+_DRIFT = 0.2  # of the sigma of one carry, that adds up along a map: what one keyframe lacks, the next ones see
 _LEAST_KEYFRAMES = 4  # of a part
 _IMAGE_ROTATION, _IMAGE_LENGTH = np.deg2rad(0.5), 0.03  # sigmas of a turn of the whole image, radians and depths
 _ROTATION, _LENGTH = np.deg2rad(0.1), 0.01  # least sigmas by points without parallax, radians and depths
@@ -44,7 +45,7 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     shared = np.array([len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in pairwise(keyframes)])
     tied = shared >= MIN_POINTS
     sigmas = _sigmas(segment.map, intrinsics)
-    segment = _held(segment, np.minimum(sigmas, np.where(tied, _TURNED, _UNKNOWN)))
+    segment = _held(segment, np.where(tied, _DRIFT * np.minimum(sigmas, _TURNED), _UNKNOWN))
     local, keyframes = segment.map, segment.map.keyframes
     number = np.concatenate([[0], np.cumsum(~(_carries(sigmas) & tied))])
     pace = _pace([pair for pair, is_tied in zip(pairwise(keyframes), tied, strict=True) if is_tied])

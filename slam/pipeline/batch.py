@@ -269,9 +269,7 @@ class SlamPipeline:
         track = self._gps_track
         return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, self.mode)
 
-    def _observe(
-        self, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None
-    ) -> Observations:
+    def _observe(self, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None) -> Observations:
         """One pass over the frames."""
         total = len(self._sequence)
         parts = self._config, self._watch, self._seed, self._sequence.camera_height_m

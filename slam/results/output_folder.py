@@ -51,7 +51,7 @@ def claim(output: Path) -> None:
     """
     check_output(output)
     output.mkdir(parents=True, exist_ok=True)
-    for path in output.iterdir():
+    for path in sorted(output.iterdir(), key=lambda path: path.name == METRICS):  # by which it is known as a run
         if path.name in MEANINGS or _is_rest(path):
             path.unlink()
 

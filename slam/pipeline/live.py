@@ -81,7 +81,6 @@ class Slam:
         mapping = config.mapping.model_copy(update={"enabled": with_map})
         config = config.model_copy(update={"mapping": mapping})
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
-        self._config, self._predictor, self._seed = config, predictor, seed
         self._pipeline = SlamPipeline(self._sequence, predictor, config, seed=seed)
         self._pipeline.require_possible()
         self._observer = Observer(predictor, intrinsics, config, Stopwatch(), seed, camera_height_m)

@@ -75,7 +75,7 @@ class Observer:
             camera_height_m: above the road; None where unknown.
         """
         self._predictor = predictor
-        self._config, self._intrinsics, self._seed = config, intrinsics, seed
+        self._config = config
         self._baseline = config.visual_odometry.rotation_baseline_steps
         self._stopwatch = stopwatch
         self._drive = Drive()

@@ -80,7 +80,6 @@ class RoadHomography:
 
     def __init__(self, config: RoadConfig, intrinsics: Intrinsics) -> None:
         """Prepare for the first step."""
-        self._config = config
         self._intrinsics = intrinsics
         long = _Shape(_FAR_HEIGHTS, _HALF_WIDTH_HEIGHTS, _RELATIVE_SIGMA)
         near = _Shape(config.near_heights, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.config.sections import KeyframesConfig
 from slam.frames import Frame, Intrinsics
-from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
+from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 
 INTRINSICS = Intrinsics(width=320, height=240, fx=290.0, fy=290.0, cx=159.5, cy=119.5)
@@ -61,13 +61,11 @@ def frame(index: int, T_world_camera: FloatArray, seed: int = 0, near: bool = Tr
     return Frame(index, index / 30.0, image(T_world_camera, seed, near))
 
 
-def tracked(
-    config: KeyframesConfig, T_world_camera: FloatArray, seeds: list[int] | None = None
-) -> KeyframeOdometryState:
-    """The state after the frames of a camera; each shows the walls of its seed."""
+def tracked(config: KeyframesConfig, T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometry:
+    """After the frames of a camera; each shows the walls of its seed."""
     odometry = KeyframeOdometry(config, INTRINSICS)
     for k, T in enumerate(T_world_camera):
         view = frame(k, T, 0 if seeds is None else seeds[k])
         odometry.follow(view)
         odometry.learn(view, depth_map(T))
-    return odometry.state()
+    return odometry

@@ -178,12 +178,10 @@ def _print_run(path: Path, metrics: Metrics) -> None:
         typer.echo(f"INTERPOLATED: frames {gap.first} to {gap.last}: {gap.reason}")
     depth = "" if provenance.depth_source == "network" else f"; depth {known(provenance.depth_source)}"
     typer.echo(f"weights {known(provenance.weights)}: {known(provenance.weights_licence)}{depth}")
-    frames, before = known(sequence.frames) or 0, known(sequence.continued_at) or 0
-    processed = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
     seconds, per_second = written(timing.seconds_total, 1), written(timing.frames_per_second, 1)
     report = path / REPORT
     typer.echo(
-        f"{processed} in {seconds} s ({per_second} a second); everything in {path}"
+        f"{known(sequence.frames) or 0} frames in {seconds} s ({per_second} a second); everything in {path}"
         + (f", read {report}" if report.is_file() else "")
     )
 

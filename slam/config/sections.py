@@ -232,10 +232,6 @@ class OutputConfig(Section):
     viewer_triangles: int = Field(
         default=60_000, ge=0, description="largest number of triangles of the map in the report; 0: no map in it"
     )
-    keep: Literal["nothing", "drive", "keyframes"] = Field(
-        default="drive",
-        description="kept for run --continue; drive: the measurements; keyframes: also the keyframes of the map",
-    )
 
 
 class SlamConfig(Section):

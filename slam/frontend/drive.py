@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -145,11 +145,7 @@ class Drive:
 
     def copy(self) -> Drive:
         """A snapshot: what is measured later is added to one of both alone."""
-        return Drive(**{name: values.copy() for name, values in self.collected().items()})
-
-    def collected(self) -> dict[str, Any]:
-        """The lists and dictionaries that grow with the frames, by name."""
-        return {name: getattr(self, name) for name in _COLLECTED}
+        return Drive(**{name: getattr(self, name).copy() for name in _COLLECTED})
 
     def since(self, first: int) -> Drive:
         """The measurements from frame ``first`` on, which becomes frame 0; without views and keyframes.

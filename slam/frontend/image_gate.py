@@ -71,11 +71,12 @@ class GateState:
 class ImageGate:
     """Classifies the images of one sequence in time order."""
 
-    def __init__(self, state: GateState | None = None) -> None:
-        self._state = state or GateState()
+    def __init__(self) -> None:
+        self._state = GateState()
 
+    @property
     def state(self) -> GateState:
-        """The state to resume from."""
+        """After the last image."""
         return self._state
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -12,8 +14,7 @@ from numpy.typing import NDArray
 from erfsfm.common.readers.pinhole import Pinhole, impossible
 from slam.frames import Intrinsics, View
 from slam.geometry.se3 import FloatArray, is_se3
-from slam.runtime.errors import RunError
-from slam.runtime.storage.archive import opened_archive, read_array
+from slam.runtime.errors import RunError, SlamError
 
 _FORMAT = 1
 # kind and shape of each array, for V views and M corners
@@ -59,8 +60,8 @@ class Places:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        with opened_archive(path) as file:
-            content = {name: read_array(file, name) for name in ("format", *_ARRAYS)}
+        with _reading(path), np.load(path, allow_pickle=False) as file:
+            content = {name: file[name] for name in ("format", *_ARRAYS)}
             if int(content["format"]) != _FORMAT:
                 raise RunError(f"{path} has format {content['format']}, this version reads {_FORMAT}: run again")
             _check(content)
@@ -69,9 +70,31 @@ class Places:
             # the part after the last view is empty
             parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
             views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
-            undistorted = "undistorted.npy" in file.namelist() and bool(read_array(file, "undistorted"))
+            undistorted = "undistorted" in file and bool(file["undistorted"])
             camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
             return cls(camera, views, content["T_world_camera"])
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn any failure inside the block into one line about ``path``; a `SlamError` is passed on.
+
+    Raises:
+        RunError: the file is missing, unreadable or damaged.
+    """
+    try:
+        yield
+    except SlamError:
+        raise
+    except FileNotFoundError as error:
+        raise RunError(f"{path} is missing: run the sequence again") from error
+    except MemoryError as error:
+        raise RunError(f"{path} needs more memory than there is, or is damaged: free some, or run again") from error
+    # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types is complete.
+    except Exception as error:
+        reason = " ".join(str(error).split())[:120]
+        detail = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
+        raise RunError(f"{path} is damaged ({detail}): run the sequence again") from error
 
 
 def _check(content: dict[str, NDArray[Any]]) -> None:

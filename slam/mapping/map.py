@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
@@ -18,11 +15,11 @@ from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.fusion import Fusion
-from slam.mapping.submap import BLOCK_VOXELS, Submap, remove_submaps, submap_path, submap_paths
+from slam.mapping.submap import BLOCK_VOXELS, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.run_files import SUBMAPS
+from slam.runtime.storage.spill import SpillFile
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
@@ -65,26 +62,18 @@ class _Stretch:
 class TsdfMap:
     """TSDF fusion of depth maps along a trajectory; lengths are in the trajectory's unit."""
 
-    def __init__(self, config: MappingConfig, intrinsics: Intrinsics, folder: Path | None = None) -> None:
-        """Prepare.
-
-        Args:
-            config: settings.
-            intrinsics: of all depth maps and images.
-            folder: parent of the folder of submaps; None keeps them in a temporary folder as long as the map lives.
-        """
+    def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
+        """Prepare for depth maps and images of these ``intrinsics``."""
         self._config = config
         self._size = (intrinsics.height, intrinsics.width)
         self._intrinsics = intrinsics
         self._filters = DepthFilters(config, intrinsics)
         self._views = ViewChooser(self._filters, config.depth_max_m)
-        self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
-        self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / SUBMAPS
-        remove_submaps(self._folder)  # of a run that was killed here
+        self._spill = SpillFile("the map")
+        self._finished: list[SpilledSubmap] = []
         self._before: deque[KeyframeDepth] = deque(maxlen=_EARLIER)
         self._waiting: KeyframeDepth | None = None
         self._stretch: _Stretch | None = None
-        self._views_of_submaps: list[NDArray[np.int64]] = []
         self._fused = self._left_out = 0
         self._surface: MapSurface | None = None
 
@@ -94,7 +83,7 @@ class TsdfMap:
         One without any depth that is certain enough is left out.
 
         Raises:
-            RunError: a submap cannot be written.
+            SlamError: the disk is full.
         """
         depth, image = keyframe.depth, keyframe.image
         if depth.shape != self._size or image.shape != (*self._size, 3):
@@ -126,7 +115,7 @@ class TsdfMap:
 
         Raises:
             EmptyMapError: nothing was fused or seen often enough.
-            SlamError: a submap cannot be written, or the disk is full.
+            SlamError: the disk is full.
         """
         self._fuse_waiting(None)
         if self._left_out and not self._before:
@@ -136,7 +125,7 @@ class TsdfMap:
             )
         if self._surface is None:
             self._finish_submap()
-            self._surface = MapSurface(submap_paths(self._folder), self._config, progress)
+            self._surface = MapSurface(self._finished, self._fused, self._config, progress)
         return self._surface
 
     def mesh(self) -> Ply:
@@ -161,7 +150,7 @@ class TsdfMap:
         try:
             surface = self.surface()
         except EmptyMapError:
-            return MapStatistics(0, 0, 0, len(self._views_of_submaps), *frames, self.voxel_size, filters, 0.0)
+            return MapStatistics(0, 0, 0, len(self._finished), *frames, self.voxel_size, filters, 0.0)
         sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
         return MapStatistics(*sizes, *frames, self.voxel_size, filters, surface.floater_share)
 
@@ -199,12 +188,10 @@ class TsdfMap:
             self._finish_submap()
 
     def _finish_submap(self) -> None:
-        """Write the submap that grows, if there is one."""
+        """Spill the submap that grows, if there is one."""
         if self._stretch is None or not self._stretch.frames:
             return
         keys, observed, tsdf, weight = self._stretch.fusion.observed()
-        numbers = {"fused": np.array(self._stretch.frames), "voxel_size": np.array(self.voxel_size)}
-        submap = Submap(keys, observed, tsdf, weight, **numbers, **self._views.take(self._intrinsics))
-        submap.write(submap_path(self._folder, len(self._views_of_submaps)))
-        self._views_of_submaps.append(submap.frames)
+        submap = Submap(keys, observed, tsdf, weight, **self._views.take(self._intrinsics))
+        self._finished.append(submap.spilled(self._spill))
         self._stretch = None

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import FloatArray
-from slam.mapping.submap import BLOCK_VOXELS, Submap
-from slam.runtime.storage.archive import reading_archive
+from slam.mapping.submap import BLOCK_VOXELS, SpilledSubmap
 
 TILE_BLOCKS = 16
 _REMEMBERED = 4  # submaps; neighbouring tiles need the same ones
@@ -32,33 +30,27 @@ class Blocks:
 class MergedSubmaps:
     """Submaps on disk; of each the block coordinates and the views' poses stay in memory."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the index of every file; raises as `Submap.read`."""
-        self._keys: list[Keys] = []
-        poses, steps, submap = [np.zeros((0, 4, 4))], [np.zeros(0)], []
-        self.fused = 0
-        for number, path in enumerate(paths):
-            with reading_archive(path), np.load(path, allow_pickle=False) as file:
-                self._keys.append(file["keys"].astype(np.int64))
-                poses.append(file["T_world_camera"])
-                steps.append(file["brightness_steps"])
-                self.fused += int(file["fused"])
-            submap += [number] * len(poses[-1])
+    def __init__(self, submaps: Sequence[SpilledSubmap]) -> None:
+        """Read what stays in memory of at least one submap."""
+        self._keys: list[Keys] = [submap.arrays["keys"].read().astype(np.int64) for submap in submaps]
+        poses, steps = (
+            [submap.arrays[name].read() for submap in submaps] for name in ("T_world_camera", "brightness_steps")
+        )
         self.T_world_views: FloatArray = np.concatenate(poses)
         self.brightness_steps: FloatArray = np.concatenate(steps)
-        self.submap_of_view = np.array(submap, dtype=np.int64)
+        self.submap_of_view = np.repeat(np.arange(len(submaps)), [len(each) for each in steps])
         self.count = len(self._keys)
-        self.read = lru_cache(maxsize=_REMEMBERED)(lambda number: Submap.read(paths[number]))
+        self.read = lru_cache(maxsize=_REMEMBERED)(lambda number: submaps[number].read())
 
     def tiles(self) -> Keys:
         """Coordinates ``(N, 3)`` of the cubes of 16 blocks a side in which anything was observed, along the drive."""
-        tiles = np.concatenate([keys // TILE_BLOCKS for keys in self._keys] or [np.zeros((0, 3), np.int64)])
+        tiles = np.concatenate([keys // TILE_BLOCKS for keys in self._keys])
         _, first = np.unique(tiles, axis=0, return_index=True)
         return tiles[np.sort(first)]
 
     def block_count(self) -> int:
         """Number of different blocks."""
-        return len(np.unique(np.concatenate(self._keys), axis=0)) if self._keys else 0
+        return len(np.unique(np.concatenate(self._keys), axis=0))
 
     def merged(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> Blocks:
         """Blocks with ``low <= key < high``: the weighted means of the blocks of all submaps."""

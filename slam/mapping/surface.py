@@ -6,7 +6,7 @@ surface are followed from tile to tile, small ones are left out, and the files a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from slam.geometry.se3 import FloatArray
 from slam.mapping.colours import Painter
 from slam.mapping.holes import with_holes_closed
 from slam.mapping.merged_submaps import TILE_BLOCKS, MergedSubmaps
-from slam.mapping.submap import BLOCK_SIDE
+from slam.mapping.submap import BLOCK_SIDE, SpilledSubmap
 from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpilledArray, SpillFile
@@ -65,25 +65,28 @@ class _Kept:
 class MapSurface:
     """The cleaned surface of finished submaps."""
 
-    def __init__(self, paths: list[Path], config: MappingConfig, progress: Progress = silent) -> None:
+    def __init__(
+        self, finished: Sequence[SpilledSubmap], fused: int, config: MappingConfig, progress: Progress = silent
+    ) -> None:
         """Merge the submaps and extract their surface.
 
         Args:
-            paths: finished submaps.
+            finished: the submaps.
+            fused: number of frames in them.
             config: voxel size and how to clean.
             progress: called with (stage, done, total).
 
         Raises:
             EmptyMapError: nothing was fused or seen often enough.
-            SlamError: a submap is damaged, or the disk is full.
+            SlamError: the disk is full.
         """
-        submaps = MergedSubmaps(paths)
-        if submaps.fused == 0:
+        if fused == 0:
             raise EmptyMapError("the map is empty: no depth passed the filters")
+        submaps = MergedSubmaps(finished)
         self._spill = SpillFile("the map")
         self._pieces: list[Piece] = []
         self.blocks, self.submaps = submaps.block_count(), submaps.count
-        self._extract(submaps, config, progress)
+        self._extract(submaps, fused, config, progress)
         if not self._pieces:
             raise EmptyMapError(f"the map is empty: no surface was seen {config.min_weight:g} times")
         self._kept = _chosen(self._pieces, config.min_component_triangles)
@@ -134,10 +137,10 @@ class MapSurface:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
         write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces)
 
-    def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress) -> None:
+    def _extract(self, submaps: MergedSubmaps, fused: int, config: MappingConfig, progress: Progress) -> None:
         painter = Painter(submaps, config.voxel_size_m, config.reach_m)
         tiles = submaps.tiles()
-        least_weight = min(config.min_weight, float(submaps.fused))  # with fewer frames nothing would be extracted
+        least_weight = min(config.min_weight, float(fused))  # with fewer frames nothing would be extracted
         for done, tile in enumerate(tiles, 1):
             patch = extract_tile(submaps, tile, config.voxel_size_m, least_weight)
             if patch is not None:

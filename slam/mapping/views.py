@@ -56,7 +56,6 @@ class ViewChooser:
         self._chosen, self._steps = [], []
         height, width = camera.height, camera.width
         return {
-            "frames": np.array([view.frame for view in views], dtype=np.int64),
             "T_world_camera": np.array([view.T_world_camera for view in views]).reshape(-1, 4, 4),
             "images": np.array([view.image for view in views], dtype=np.uint8).reshape(-1, height, width, 3),
             "depths": np.array([view.depth for view in views], dtype=np.float16).reshape(-1, height, width),

@@ -1,1 +1,1 @@
-"""The pipeline: batch runs over all frames, live sessions frame by frame, and their checkpoints on disk."""
+"""The pipeline: batch runs over all frames and live sessions frame by frame."""

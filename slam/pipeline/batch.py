@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 
 from erfsfm.common.progress import Progress, silent
 from erfsfm.mvs.refine import Decide
@@ -21,7 +20,6 @@ from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
-from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, lidar_path, usable_steps
 from slam.frontend.network_factors import chain_raw
@@ -39,13 +37,12 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.depth_refinement import decision
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
-from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_doubts, warn_of_missing_keyframes
+from slam.pipeline.drive_warnings import warn_of_doubts
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.fusion import fuse
 from slam.pipeline.input_checks import require_possible
 from slam.pipeline.map_closure import MapClosure, close_maps
+from slam.pipeline.observations import Observations
 from slam.pipeline.observer import Observer
 from slam.pipeline.odometry import Keep, Odometry, Solution, keep_nothing
 from slam.pipeline.pending import read_frame
@@ -55,7 +52,6 @@ from slam.runtime.imports import import_open3d_beside
 from slam.runtime.storage.record import Missing
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
-from slam.sequences.continued import Continued
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +65,6 @@ class SlamPipeline:
         predictor: Predictor,
         config: SlamConfig,
         progress: Progress = silent,
-        checkpoint: SessionCheckpoint | None = None,
         seed: int = 0,
         gps_track: GpsTrack | None = None,
     ) -> None:
@@ -80,14 +75,11 @@ class SlamPipeline:
             predictor: depth and snippet poses.
             config: of all parts.
             progress: called with the stage, done and total.
-            checkpoint: measurements of the first frames of the sequence, whose images are then not read.
             seed: of all RANSAC draws.
             gps_track: positions of the drive.
         """
         self._sequence, self._predictor, self._config = sequence, predictor, config
         self._progress = progress
-        self._checkpoint = checkpoint
-        self.first = 0 if checkpoint is None else len(checkpoint.state.drive)  # frames before are measured
         self._seed = seed
         self._gps_track = gps_track
         self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
@@ -104,7 +96,6 @@ class SlamPipeline:
 
     def estimate(
         self,
-        checkpoints: CheckpointWriter | None = None,
         frames: Iterator[Frame] | None = None,
         watch: Callable[[Observer], None] | None = None,
         keep: Keep = keep_nothing,
@@ -112,7 +103,6 @@ class SlamPipeline:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
 
         Args:
-            checkpoints: keeps the state of the pass, given to it every 100 frames.
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
             keep: as in `solve`.
@@ -120,24 +110,21 @@ class SlamPipeline:
         self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        maps, state = self._observe(checkpoints, frames, watch)
+        observed = self._observe(frames, watch)
         self._progress("loops and graph", 0, 1)
-        estimate = self.solve(maps, state, keep)
-        warn_of_doubts(estimate.drive, state.gate)
-        if isinstance(self._sequence, Continued):
-            warn_of_another_place(estimate.drive, self.first)
+        estimate = self.solve(observed, keep)
+        warn_of_doubts(estimate.drive, observed.gate)
         self._progress("loops and graph", 1, 1)
         return estimate
 
-    def solve(self, maps: Sequence[MapSegment], state: FrontEndState, keep: Keep = keep_nothing) -> Estimate:
+    def solve(self, observed: Observations, keep: Keep = keep_nothing) -> Estimate:
         """Lengths, factors and loops of a drive, and the trajectory that fits them.
 
         An error in the search for loops costs the loops, one in the graph the loops and the graph: the optimised
         trajectory then is the odometry.
 
         Args:
-            maps: of keyframes; none of a drive that is measured by steps alone.
-            state: after the last frame.
+            observed: all measurements.
             keep: given each trajectory by its name as soon as it is known: all but the last before loops are sought.
 
         Raises:
@@ -146,23 +133,23 @@ class SlamPipeline:
         if (reference := self._reference) is not None:
             keep("reference", reference)
         with self._watch.stage("geometry"):
-            poses = keyframe_poses(maps, self._sequence.intrinsics, self._seed)
-        drive = self._completed(maps, state, MapClosure(poses))
+            poses = keyframe_poses(observed.maps, self._sequence.intrinsics, self._seed)
+        drive = self._completed(observed, MapClosure(poses))
         T_network = chain_raw(drive.snippets, len(drive))
         keep("network", self._trajectory(T_network))
-        odometry = self._measured(drive, T_network, state)
+        odometry = self._measured(drive, T_network, observed)
         keep("odometry", self._trajectory(odometry.T_world_camera))
         with self._watch.stage("loops"):
-            found = attempt("loop closure", lambda: self._closed(odometry, maps, state))
+            found = attempt("loop closure", lambda: self._closed(odometry, observed))
         odometry, loops = (odometry, LoopClosures(not_sought=found.reason)) if isinstance(found, Missing) else found
         at = odometry.T_world_camera, odometry.scale.estimate
         location = None if self._positioning is None else self._positioning.locate(*at)
         solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
         if isinstance(solved, Missing):
             solved = Solution(solved, odometry.T_world_camera, LoopClosures(not_sought=solved.reason), location)
-        return self._estimate(state, odometry, solved)
+        return self._estimate(observed, odometry, solved)
 
-    def _estimate(self, state: FrontEndState, odometry: Odometry, solved: Solution) -> Estimate:
+    def _estimate(self, observed: Observations, odometry: Odometry, solved: Solution) -> Estimate:
         """All of it, with what follows for its confidence."""
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
         if self._positioning is not None and self._positioning.agreement is not None:
@@ -171,7 +158,7 @@ class SlamPipeline:
         support = None if drive.maps else agreement.frame_support(range(len(drive)), drive.motions)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         camera = self._sequence.intrinsics
-        of_images = agreement.of_images(drive, state.odometry, camera, support, scale.contradicted, needs_road)
+        of_images = agreement.of_images(drive, observed.odometry, camera, support, scale.contradicted, needs_road)
         if not drive.maps:
             of_images.append(agreement.of_directions(odometry.T_world_camera))
         trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]
@@ -182,55 +169,52 @@ class SlamPipeline:
             lidar=odometry.lidar,
             reference=self._reference,
             drive=drive,
-            state=state,
+            depth_error=observed.odometry.depth_error,
             scale=scale,
             factors=odometry.factors,
             views=odometry.views(),
             loops=solved.loops,
             graph=solved.graph,
             location=solved.location,
-            first=self.first,
             stopwatch=self._watch,
             agreements=(*by_sources, *of_images),
             confidence=agreement.confidence(trusted, scale.is_metric, bool(drive.maps)),
             support=support,
         )
 
-    def _completed(self, maps: Sequence[MapSegment], state: FrontEndState, closure: MapClosure) -> Drive:
+    def _completed(self, observed: Observations, closure: MapClosure) -> Drive:
         """The drive with its gaps interpolated and the poses of its maps."""
-        events = [*(() if state.keyframes is None else state.keyframes.events), *closure.joins]
-        return complete_drive(state.drive, self._predictor.sources, maps, closure.poses, events)
+        events = [*observed.events, *closure.joins]
+        return complete_drive(observed.drive, self._predictor.sources, observed.maps, closure.poses, events)
 
-    def _closed(
-        self, odometry: Odometry, maps: Sequence[MapSegment], state: FrontEndState
-    ) -> tuple[Odometry, LoopClosures]:
+    def _closed(self, odometry: Odometry, observed: Observations) -> tuple[Odometry, LoopClosures]:
         """The loops of a drive, and its odometry, which that of closed maps replaces."""
         camera, config, seed = self._sequence.intrinsics, self._config.loops, self._seed
-        if not (maps and config.enabled):
+        if not (observed.maps and config.enabled):
             views, is_metric = odometry.views(), odometry.scale.is_metric
             return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
-        closure = close_maps(maps, odometry.drive.map_poses, camera, seed)
+        closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
         if closure.loops:
-            odometry = self._chained(replace(odometry, drive=self._completed(maps, state, closure)))
+            odometry = self._chained(replace(odometry, drive=self._completed(observed, closure)))
         return odometry, closure.closures(odometry.scale)
 
-    def _compared(self, drive: Drive, steps: Sequence[RelativePose], state: FrontEndState) -> list[Agreement]:
+    def _compared(self, drive: Drive, steps: Sequence[RelativePose], observed: Observations) -> list[Agreement]:
         """LiDAR and depth from elsewhere beside the images; ``SlamError`` where lengths by LiDAR alone are wrong."""
         by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated)]
         if (height := height_by_lidar(steps, drive)) is not None:
             by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self._sequence.camera_height_m, 0.0))
         found = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
         compared = [] if found is None else [found.required() if self.mode == "lidar" else found.said()]
-        source, error = self._config.depth.source, state.odometry.depth_error
+        source, error = self._config.depth.source, observed.odometry.depth_error
         by_depth = None if source == "network" else agreement.of_depth(source, error)
         return compared if by_depth is None else [*compared, by_depth.required()]
 
-    def _measured(self, drive: Drive, T_network: FloatArray, state: FrontEndState) -> Odometry:
+    def _measured(self, drive: Drive, T_network: FloatArray, observed: Observations) -> Odometry:
         """Lengths, factors and odometry of a completed drive."""
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence, self._progress)
         steps = usable_steps(lidar, are_needed=self.mode == "lidar")
-        agreements = self._compared(drive, steps, state)
+        agreements = self._compared(drive, steps, observed)
         if any(each.is_wrong for each in agreements if each.source == LIDAR_SOURCE):
             steps = []
         with self._watch.stage("scale"):
@@ -260,13 +244,12 @@ class SlamPipeline:
         self,
         estimate: Estimate,
         compare: Callable[[KeyframeDepth], None] | None = None,
-        folder: Path | None = None,
     ) -> TsdfMap | None:
-        """The map, as `fusion.fuse`; None where mapping is switched off, or no keyframe was kept."""
+        """The map, as `fusion.fuse`; None where mapping is switched off, or no frame has depth."""
         if not self._config.mapping.enabled or not estimate.drive.keyframes:
             return None
         camera, progress = self._sequence.intrinsics, self._progress
-        return fuse(estimate, camera, self._config, self._decide, compare, folder, progress)
+        return fuse(estimate, camera, self._config, self._decide, compare, progress)
 
     def require_possible(self) -> None:
         """Check that this run can succeed; raises as `input_checks.require_possible` and `Positioning`."""
@@ -286,31 +269,19 @@ class SlamPipeline:
         track = self._gps_track
         return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, self.mode)
 
-    def _observe(
-        self,
-        checkpoints: CheckpointWriter | None,
-        frames: Iterator[Frame] | None,
-        watch: Callable[[Observer], None] | None,
-    ) -> tuple[tuple[MapSegment, ...], FrontEndState]:
-        """One pass over the frames, or over those that follow a checkpoint."""
-        checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
-        state = None if checkpoint is None else checkpoint.state
-        if state is not None and self._config.mapping.enabled:
-            warn_of_missing_keyframes(state.drive, first)
-        parts = self._config, self._watch, self._seed, state, self._sequence.camera_height_m
+    def _observe(self, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None) -> Observations:
+        """One pass over the frames."""
+        total = len(self._sequence)
+        parts = self._config, self._watch, self._seed, self._sequence.camera_height_m
         observer = Observer(self._predictor, self._sequence.intrinsics, *parts)
-        ahead = read_ahead(partial(read_frame, self._sequence), range(first, total))
+        ahead = read_ahead(partial(read_frame, self._sequence), range(total))
         with observer, closing(ahead) as read:
-            for index, frame in enumerate(self._watch.each("read", frames or read), first):
+            for index, frame in enumerate(self._watch.each("read", frames or read)):
                 observer.add(index, frame)
                 if watch is not None:
                     watch(observer)
                 self._progress("frames", index + 1, total)
-                done = index + 1 - first
-                if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 != total:
-                    with self._watch.stage("journal"):
-                        checkpoints.keep(observer.state())
-            return observer.maps(), observer.state()
+            return observer.observations()
 
     def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry, by what the mode knows of the drive."""

@@ -55,22 +55,3 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
                 last,
                 first - 1,
             )
-
-
-def warn_of_another_place(drive: Drive, first: int) -> None:
-    """Copies of other recordings under the same name, and folders, are known by their first image alone."""
-    for start, end, reason in drive.failures:
-        if (start, end) == (first - 1, first) and first not in drive.interpolated:
-            logger.warning(
-                "frame %d, the first that follows, does not match frame %d (%s): make sure that it was taken "
-                "right after it on the same drive",
-                end,
-                start,
-                reason,
-            )
-
-
-def warn_of_missing_keyframes(drive: Drive, first: int) -> None:
-    """Warn where the run that goes on at frame ``first`` has no images of those before."""
-    if not drive.keyframes:
-        logger.warning("the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first)

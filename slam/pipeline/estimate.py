@@ -13,12 +13,12 @@ from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale.metric_scale import Scale
+from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
 from slam.mapping.map import TsdfMap
-from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.positioning import Location
 from slam.runtime.storage.record import Missing
 from slam.runtime.timing import Stopwatch
@@ -29,7 +29,7 @@ class Estimate:
     """Trajectories with one row a frame, the factors and loops they fit, the graph, and the map once it is fused.
 
     ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
-    ``state`` is that of the front end, for a run that continues this one; frames before ``first`` are of earlier runs.
+    ``depth_error`` is that of learned depth, as the steps of the drive show it.
     ``graph`` is the reason where it has no solution: the optimised trajectory then is the odometry.
     ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
     each optional source contradicts the images, ``confidence`` what follows from all of them, or why nothing does;
@@ -42,14 +42,13 @@ class Estimate:
     lidar: LidarPath | MeasurementFailure | None
     reference: Trajectory | None
     drive: Drive
-    state: FrontEndState
+    depth_error: DepthError
     scale: Scale
     factors: list[RelativePose]
     views: list[View]
     loops: LoopClosures
     graph: PoseGraph | Missing
     location: Location | MeasurementFailure | None
-    first: int
     stopwatch: Stopwatch
     confidence: float | MeasurementFailure
     support: FloatArray | None

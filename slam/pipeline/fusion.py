@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 
 from erfsfm.common.progress import Progress
 from erfsfm.mvs.refine import Decide
@@ -24,7 +23,6 @@ def fuse(
     config: SlamConfig,
     decide: Decide | None,
     compare: Callable[[KeyframeDepth], None] | None,
-    folder: Path | None,
     progress: Progress,
 ) -> TsdfMap:
     """Learned depth at the optimised poses, refined and fused into one surface.
@@ -38,18 +36,17 @@ def fuse(
         config: of all parts.
         decide: between learned and measured depth; None where it is not refined.
         compare: called with the depth of each keyframe that is far enough from the one before.
-        folder: where finished submaps go; a temporary one where it is None.
         progress: called with the stage, done and total.
     """
     keyframes, T_world_camera = estimate.drive.keyframes, estimate.optimised.T_world_camera
     height, width = keyframes[0].depth_unscaled.shape
     intrinsics = intrinsics.resized(width, height)
     scales, is_carried = estimate.scale.per_frame, bool(estimate.drive.maps)
-    error = DepthError() if is_carried else estimate.state.odometry.depth_error
+    error = DepthError() if is_carried else estimate.depth_error
     guess_sigma = ROOM_SIGMA if is_carried and config.depth.is_learned else None
     depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, decide, guess_sigma)
     mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
-    tsdf_map = TsdfMap(mapping, intrinsics, folder)
+    tsdf_map = TsdfMap(mapping, intrinsics)
     selected = tsdf_map.select([keyframe.index for keyframe in keyframes], T_world_camera)
     with closing(read_ahead(depths.at, selected, CORES)) as ahead:
         for done, keyframe in enumerate(estimate.stopwatch.each("depth refinement", ahead), 1):

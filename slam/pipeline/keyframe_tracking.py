@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from typing import Literal
@@ -11,13 +11,13 @@ import numpy as np
 
 from erfsfm.common.threads import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
-from slam.frames import DepthMap, Frame, Intrinsics, View
+from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.flow import new_corners
 from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.map_segment import MapSegment
-from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
+from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.unit import learned_unit
 from slam.geometry.se3 import FloatArray, invert
@@ -62,29 +62,25 @@ class KeyframeTracking:
         loops: LoopsConfig,
         intrinsics: Intrinsics,
         seed: int,
-        state: KeyframeOdometryState | None,
         camera_height_m: float | None = None,
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
-        """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone.
-
-        ``on_keyframe`` is told of a keyframe before it is adjusted.
-        """
+        """Prepare for the first frame; ``on_keyframe`` is told of a keyframe before it is adjusted."""
         self._config, self._loops, self._intrinsics, self._seed = config, loops, intrinsics, seed
         self._camera_height_m = camera_height_m
         self._lost: MapSegment | None = None
         self._places: Relocaliser | None = None  # of the lost map
-        self._front_end: FrontEnd = "steps" if state is None else "both"
+        self._front_end: FrontEnd = "both"
         self._cores = ExitStack()
-        self._odometry: KeyframeOdometry | None = None
-        if state is not None:
-            # the networks, which predict little for keyframes, leave their core to optical flow
-            self._cores.enter_context(opencv_threads(usable_cores()))
-            self._odometry = KeyframeOdometry(config, intrinsics, seed, state, on_keyframe)
+        # the networks, which predict little for keyframes, leave their core to optical flow
+        self._cores.enter_context(opencv_threads(usable_cores()))
+        self._odometry: KeyframeOdometry | None = KeyframeOdometry(config, intrinsics, seed, on_keyframe)
+        self.choose(Drive())
 
-    def state(self) -> KeyframeOdometryState | None:
-        """The state to resume from."""
-        return None if self._odometry is None else self._odometry.state()
+    @property
+    def events(self) -> Sequence[TrackingEvent]:
+        """What became of the maps so far."""
+        return () if self._odometry is None else self._odometry.events
 
     def follow(self, frame: Frame) -> None:
         """Track the next usable frame; a lost camera is looked for among the keyframes of its map."""

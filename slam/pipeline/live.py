@@ -19,18 +19,13 @@ from slam.loops.closure import LoopClosures
 from slam.loops.structure import PlaceStructure
 from slam.loops.thresholds import OF_KEYFRAMES
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.front_end_state import FrontEndState
-from slam.pipeline.keyframe_tracking import choose
 from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.observer import Observer
 from slam.prediction.assembly import make_predictor, open_depth
-from slam.prediction.depth_source import mixed_sha256
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH
-from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import Missing
 from slam.runtime.threads import Turns, in_turn
 from slam.runtime.timing import Stopwatch
@@ -39,7 +34,7 @@ from slam.sequences.recording import POSSIBLE_PERIODS_S
 
 
 class Slam:
-    """Monocular SLAM frame by frame; it keeps no images, unless a `surface` is wanted.
+    """Monocular SLAM frame by frame; it keeps no images, unless a map is wanted.
 
     Poses come from the measurements of the last 100 frames; older ones stay, so a frame costs the same however long
     the drive is. `close_loops` solves the whole drive as `run` does. Threads may share a session: each call waits for
@@ -54,7 +49,7 @@ class Slam:
         camera_height_m: float | None = None,
         update_frames: int = 10,
         sweep_frames: int = 0,
-        weights_sha256: str = "",
+        with_map: bool = False,
         seed: int = 0,
     ) -> None:
         """Prepare for the first frame.
@@ -62,12 +57,12 @@ class Slam:
         Args:
             predictor: depth and snippet poses; ``config.depth`` is read by `from_weights` alone.
             intrinsics: of all images.
-            config: None for the defaults; ``output.keep=keyframes`` keeps images on disk, for `surface` and `clouds`.
+            config: None for the defaults; ``mapping.enabled`` has no effect.
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
             update_frames: lengths of the last steps are solved after so many frames.
             sweep_frames: the whole drive is solved after so many frames, which takes longer the longer it is; 0: only
                 in ``close_loops``.
-            weights_sha256: of the networks and the depth source, to refuse resuming a session of others.
+            with_map: keep images on disk, for `surface` and `clouds`.
             seed: of all RANSAC draws.
 
         Raises:
@@ -83,14 +78,12 @@ class Slam:
                 f"wanted update_frames >= 1, sweep_frames >= 0 and a seed of 31 bits; got {update_frames}, "
                 f"{sweep_frames} and {seed}"
             )
-        kept = {"enabled": config.output.keep == "keyframes"}
-        config = config.model_copy(update={"mapping": config.mapping.model_copy(update=kept)})
-        self._weights_sha256 = weights_sha256
+        mapping = config.mapping.model_copy(update={"enabled": with_map})
+        config = config.model_copy(update={"mapping": mapping})
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
-        self._config, self._predictor, self._seed = config, predictor, seed
         self._pipeline = SlamPipeline(self._sequence, predictor, config, seed=seed)
         self._pipeline.require_possible()
-        self._observer = self._observe(None)
+        self._observer = Observer(predictor, intrinsics, config, Stopwatch(), seed, camera_height_m)
         self._is_closed = False
         self._poses = LivePoses(predictor.sources, camera_height_m, config, update=update_frames)
         self._sweep_frames = sweep_frames
@@ -105,6 +98,7 @@ class Slam:
         config: SlamConfig | None = None,
         camera_height_m: float | None = None,
         device: str = "cpu",
+        with_map: bool = False,
     ) -> Slam:
         """With a shipped model by name or a training output folder; depth is that of ``config.depth``.
 
@@ -117,13 +111,7 @@ class Slam:
         source = open_depth(depth, intrinsics, None)
         networks = DepthPosePredictor.from_weights(name_or_dir, device, "onnx")
         predictor = make_predictor(networks, source, depth, intrinsics)
-        return cls(
-            predictor,
-            intrinsics,
-            config,
-            camera_height_m,
-            weights_sha256=mixed_sha256(networks.sha256, source),
-        )
+        return cls(predictor, intrinsics, config, camera_height_m, with_map=with_map)
 
     def __len__(self) -> int:
         """Number of frames so far."""
@@ -166,7 +154,7 @@ class Slam:
             SlamError: the session is closed.
         """
         if self._is_closed:
-            raise SlamError("this session is closed: make another Slam and resume what was saved of this one")
+            raise SlamError("this session is closed: make another Slam")
         size = (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3)
         shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
         if not isinstance(image, np.ndarray) or shape != size or kind != np.uint8:
@@ -192,38 +180,6 @@ class Slam:
         return self._newest
 
     @in_turn
-    def save(self, path: str | Path) -> None:
-        """Write all measurements to a file for `resume`; more frames may follow.
-
-        Raises:
-            SlamError: the file cannot be written.
-        """
-        checkpoint = SessionCheckpoint.of(self._sequence, self._observer.state(), self._weights_sha256)
-        write_atomically(Path(path), checkpoint.write)
-
-    @in_turn
-    def resume(self, path: str | Path) -> None:
-        """Continue after the last frame of a file by `save`, with the whole drive solved.
-
-        Raises:
-            SlamError: there are frames already, or the file is missing, damaged or of another camera, other weights or
-                another ``keyframes.use``.
-        """
-        if len(self):
-            raise SlamError(f"{path} can only be resumed before the first frame; there are {len(self)} already")
-        checkpoint = SessionCheckpoint.read(Path(path))
-        mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
-        if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
-            raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
-        front_end = choose(self._config.keyframes, self._sequence.camera_height_m, checkpoint.state.drive)
-        if (front_end == "steps") != (checkpoint.state.keyframes is None):
-            raise SlamError(f"{path} was made with another keyframes.use: make Slam with the same")
-        self._observer.close()
-        self._observer, self._is_closed = self._observe(checkpoint.state), False
-        self._sequence.stamps = checkpoint.stamps
-        self.close_loops()
-
-    @in_turn
     def trajectory(self) -> Trajectory:
         """All frames so far, lengths in `unit_name`; before the first snippet the camera is assumed to stay in place.
 
@@ -246,7 +202,7 @@ class Slam:
         self._observer.flush()
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        estimate = self._pipeline.solve(self._observer.maps(), self._observer.state())
+        estimate = self._pipeline.solve(self._observer.observations())
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         self._estimate = estimate
         return estimate.loops
@@ -291,11 +247,11 @@ class Slam:
         """The map of the drive so far as an Open3D ``TriangleMesh``, y down; raises as `keyframes`.
 
         Raises:
-            SlamError: the session was made without ``output.keep=keyframes``, or nothing was seen often enough.
+            SlamError: the session was made without ``with_map``, or nothing was seen often enough.
         """
         fused = self._pipeline.fuse(self._solved())
         if fused is None:
-            raise SlamError("this session keeps no images: make Slam with output.keep=keyframes")
+            raise SlamError("this session keeps no images: make Slam with with_map=True")
         with tempfile.TemporaryDirectory(prefix="erfsfm-slam-surface-") as folder:
             fused.surface().write_mesh(Path(folder) / MAP_MESH)
             return import_open3d().io.read_triangle_mesh(str(Path(folder) / MAP_MESH))
@@ -304,7 +260,7 @@ class Slam:
     def clouds(self, first: int = 0, stride: int = 4) -> dict[int, FloatArray]:
         """Learned depth of each frame kept since ``first``: points ``(M, 3)`` in its camera, in `unit_name`.
 
-        Of every ``stride``-th pixel. Without ``output.keep=keyframes`` no frame is kept.
+        Of every ``stride``-th pixel. Without ``with_map`` no frame is kept.
         """
         self._observer.flush()
         kept = (each for each in self._observer.drive.keyframes if each.index >= first)
@@ -318,17 +274,6 @@ class Slam:
         if self._estimate is None:
             raise SlamError("there are too few usable frames to solve the drive")
         return self._estimate
-
-    def _observe(self, state: FrontEndState | None) -> Observer:
-        return Observer(
-            self._predictor,
-            self._sequence.intrinsics,
-            self._config,
-            Stopwatch(),
-            seed=self._seed,
-            state=state,
-            camera_height_m=self._sequence.camera_height_m,
-        )
 
 
 def _check(intrinsics: Intrinsics, camera_height_m: float | None, config: SlamConfig | None) -> None:

@@ -17,8 +17,6 @@ from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.keyframes.map_segment import MapSegment
-from slam.frontend.keyframes.odometry import KeyframeOdometryState
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
@@ -26,9 +24,17 @@ from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
-from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.pending import PendingFrame, PendingTask, has_moved_on, height_of, last_step, predicted_depth
+from slam.pipeline.observations import Observations
+from slam.pipeline.pending import (
+    PendingFrame,
+    PendingTask,
+    RecentFrame,
+    has_moved_on,
+    height_of,
+    last_step,
+    predicted_depth,
+)
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.memory import return_freed_memory
 from slam.runtime.storage.spill import SpillFile
@@ -56,10 +62,9 @@ class Observer:
         config: SlamConfig,
         stopwatch: Stopwatch,
         seed: int = 0,
-        state: FrontEndState | None = None,
         camera_height_m: float | None = None,
     ) -> None:
-        """Prepare for the first frame, or resume from a state.
+        """Prepare for the first frame.
 
         Args:
             predictor: depth and snippet poses.
@@ -67,29 +72,24 @@ class Observer:
             config: of all parts.
             stopwatch: measures the time of stages.
             seed: of all RANSAC draws.
-            state: of an observer of the same predictor, camera and configuration.
             camera_height_m: above the road; None where unknown.
         """
         self._predictor = predictor
-        self._config, self._intrinsics, self._seed = config, intrinsics, seed
+        self._config = config
         self._baseline = config.visual_odometry.rotation_baseline_steps
         self._stopwatch = stopwatch
-        self._drive = Drive() if state is None else state.drive.copy()
-        self._gate = ImageGate(None if state is None else state.gate)
-        self._odometry = VisualOdometry(
-            config.visual_odometry, intrinsics, seed, None if state is None else state.odometry
-        )
-        keyframes = KeyframeOdometryState() if state is None else state.keyframes
-        parts = config.keyframes, config.loops, intrinsics, seed, keyframes, camera_height_m
+        self._drive = Drive()
+        self._gate = ImageGate()
+        self._odometry = VisualOdometry(config.visual_odometry, intrinsics, seed)
+        parts = config.keyframes, config.loops, intrinsics, seed, camera_height_m
         self._keyframes = KeyframeTracking(*parts, self._predict_depth)
-        self._keyframes.choose(self._drive)
-        self._road = RoadHomography(config.road, intrinsics, () if state is None else state.road_directions)
+        self._road = RoadHomography(config.road, intrinsics)
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
-        self._snippet_frames: tuple[Frame, ...] = () if state is None else state.snippet_frames
-        self._recent: tuple[RecentFrame, ...] = () if state is None else state.recent
-        self._unread = 0 if state is None else state.unread
-        self._depth_index = -1 if state is None else state.depth_index
+        self._snippet_frames: tuple[Frame, ...] = ()
+        self._recent: tuple[RecentFrame, ...] = ()
+        self._unread = 0  # frames in a row whose image cannot be read
+        self._depth_index = -1  # the last frame whose depth was asked for
         self._spill_file = SpillFile()
         self._networks = predictor.executor()
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="beside")
@@ -141,12 +141,12 @@ class Observer:
         while self._tasks:
             self._finish_tasks()
 
-    def state(self) -> FrontEndState:
-        """A snapshot from which another observer continues as without an interruption."""
+    def observations(self) -> Observations:
+        """All measurements so far; more frames may follow."""
         self.flush()
-        parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
-        last = self._snippet_frames, self._recent, self._unread, self._depth_index
-        return FrontEndState(self._drive.copy(), *parts, *last)
+        maps = self._keyframes.maps(self._drive)
+        events = list(self._keyframes.events)
+        return Observations(self._drive.copy(), self._gate.state, self._odometry.state, maps, events)
 
     @property
     def frames(self) -> int:
@@ -161,11 +161,6 @@ class Observer:
     def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:
         """As `KeyframeTracking.step`, of a finished frame."""
         return self._keyframes.step(index)
-
-    def maps(self) -> tuple[MapSegment, ...]:
-        """The maps of keyframes so far, as `KeyframeTracking.maps`; more frames may follow."""
-        self.flush()
-        return self._keyframes.maps(self._drive)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -198,7 +193,7 @@ class Observer:
             self._depth_index, depth = index, self._networks.submit(predicted_depth, self._predictor, frame)
         if len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0):
             snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
-        return PendingFrame(frame, depth, snippet, self._gate.state().standing)
+        return PendingFrame(frame, depth, snippet, self._gate.state.standing)
 
     def _process_pending(self) -> None:
         """All measurements but the networks' of the pending frame."""
@@ -250,7 +245,7 @@ class Observer:
         """Everything that the depth ``(H, W)`` of a frame gives."""
         frame, depth = pending.frame, pending.visible(depth)
         with self._stopwatch.stage("road"):
-            self._drive.roads[frame.index] = road = self._plane.fit(depth, self._odometry.state().depth_error)
+            self._drive.roads[frame.index] = road = self._plane.fit(depth, self._odometry.state.depth_error)
         self._keyframes.learn(frame, depth)
         height = self._remember(frame, depth, height_of(road))
         views, loops = self._drive.views, self._config.loops
@@ -258,7 +253,7 @@ class Observer:
             with self._stopwatch.stage("loops"):
                 view = self._features.view(frame, depth, height)
                 learned = view.points[:, 2].astype(np.float64)
-                views.append(view.scaled(self._odometry.state().depth_error.corrected(learned) / learned))
+                views.append(view.scaled(self._odometry.state.depth_error.corrected(learned) / learned))
         self._keep(frame, depth)
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:
@@ -269,7 +264,7 @@ class Observer:
         if carried is not None:
             return carried
         depth = self._networks.submit(predicted_depth, self._predictor, recent.frame).result()
-        road = self._plane.fit(depth, self._odometry.state().depth_error)
+        road = self._plane.fit(depth, self._odometry.state.depth_error)
         return depth, self._remember(recent.frame, depth, height_of(road))
 
     def _carried(self, recent: RecentFrame) -> tuple[DepthMap, float | None] | None:

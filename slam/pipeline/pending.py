@@ -42,6 +42,15 @@ class PendingFrame:
 
 
 @dataclass(frozen=True)
+class RecentFrame:
+    """A frame to measure steps from, its depth ``(H, W)``, None until that is needed, and camera height, unscaled."""
+
+    frame: Frame
+    depth: DepthMap | None
+    height: float | None
+
+
+@dataclass(frozen=True)
 class PendingTask:
     """A task of another thread, the stage that waits for it, and what to do with its ``result``."""
 

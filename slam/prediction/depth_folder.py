@@ -30,14 +30,12 @@ Undistort = Callable[[DepthMap], DepthMap]  # z-depth (H, W) of a stored image t
 class FrameNumbers:
     """Which frames of a recording a run has.
 
-    ``count`` frames from frame ``start`` of a recording of ``total``; they have the numbers from ``first`` on in the
-    run, which is not 0 where it continues another.
+    ``count`` frames from frame ``start`` of a recording of ``total``.
     """
 
     count: int
     start: int
     total: int
-    first: int = 0
 
 
 class DepthFolder:
@@ -59,7 +57,6 @@ class DepthFolder:
         """
         self.name = config.source
         suffix, _, path = config.source.partition(":")
-        self.identity = f"{suffix} {config.kind} {config.align} {config.png_scale}"
         self._kind: Kind = "disparity" if config.kind == "disparity" else "depth"
         self._scale = config.png_scale if suffix == "png" else 1.0
         self._size, self._undistort = (height, width), undistort
@@ -69,21 +66,19 @@ class DepthFolder:
         with sequence_errors():
             files = by_name(paths)
         before = _frames_before(folder, suffix, len(files), numbers)
-        self._folder, self._first = folder, numbers.first
-        self._rows = {row + numbers.first - before: file for row, file in zip(files.rows, files.paths, strict=True)}
-        self._range = range(numbers.first, numbers.first + numbers.count)
+        self._folder = folder
+        self._rows = {row - before: file for row, file in zip(files.rows, files.paths, strict=True)}
+        self._range = range(numbers.count)
         self.sha256 = self._checked(_header_of_png if suffix == "png" else _header_of_npy, width, height)
 
-    def disparity(self, frame: Frame) -> Disparity | None:
-        """1/depth ``(h, w)`` of a frame, NaN where unknown; None for frames before the first file.
+    def disparity(self, frame: Frame) -> Disparity:
+        """1/depth ``(h, w)`` of a frame, NaN where unknown.
 
         Raises:
             SlamError: its file is missing, or was changed since it was checked.
         """
         path = self._rows.get(frame.index)
         if path is None:
-            if frame.index < self._first:
-                return None
             raise SlamError(f"{self._folder} has no depth for frame {frame.index}: its number is missing, add the file")
         with sequence_errors():
             values = self._read(path)

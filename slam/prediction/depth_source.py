@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -31,16 +30,14 @@ _REWEIGHTINGS = 8
 class DepthSource(Protocol):
     """Depth of the frames of one sequence in a unit of its own.
 
-    ``name`` is that of the configuration, ``sha256`` that of the content. ``identity`` has to be equal in two runs for
-    one to continue the other.
+    ``name`` is that of the configuration, ``sha256`` that of the content.
     """
 
     name: str
     sha256: str
-    identity: str
 
-    def disparity(self, frame: Frame) -> Disparity | None:
-        """1/depth ``(h, w)`` of any size, NaN where unknown; None for a frame from before the source's first."""
+    def disparity(self, frame: Frame) -> Disparity:
+        """1/depth ``(h, w)`` of any size, NaN where unknown."""
 
 
 class SourcedPredictor:
@@ -105,8 +102,6 @@ class SourcedPredictor:
     def _align_to_networks(self, frame: Frame) -> _Aligned:
         height, width = frame.image.shape[:2]
         disparity = self._source.disparity(frame)
-        if disparity is None:
-            return _Aligned(np.full((height, width), np.nan, np.float32), np.nan)
         disparity = at_size(disparity, height, width)
         step = max(int(np.sqrt(height * width / _COMPARED)), 1)
         own, wanted = (map_[::step, ::step].astype(np.float64) for map_ in (disparity, 1 / self._networks.depth(frame)))
@@ -159,13 +154,6 @@ def at_size(disparity: Disparity, height: int, width: int) -> Disparity:
         for part in (known, np.where(known, disparity, 0))
     )
     return np.where(weight >= least, total / np.maximum(weight, least), np.float32(np.nan)).astype(np.float32)
-
-
-def mixed_sha256(networks_sha256: str, source: DepthSource | None) -> str:
-    """Identity of everything that predicts: of the weights alone where depth is theirs."""
-    if source is None:
-        return networks_sha256
-    return hashlib.sha256(f"{networks_sha256} {source.identity}".encode()).hexdigest()
 
 
 def _unit(own: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:

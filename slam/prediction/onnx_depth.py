@@ -55,8 +55,6 @@ class OnnxDepth:
         own = notes.get("input") == _OWN_INPUT and notes.get("kind") == "depth"
         self._kind, self._mean, self._std = self._settings(config, own)
         self._output = self._depth_output(config)
-        numbers = (self._mean.tolist(), self._std.tolist(), self._height, self._width, self._output)
-        self.identity = f"onnx {self.sha256} {self._kind} {config.align} {numbers}"
         self._run(np.zeros((self._height, self._width, 3), np.uint8))
 
     def disparity(self, frame: Frame) -> Disparity:

@@ -14,7 +14,7 @@ from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.errors import SlamError
 from slam.runtime.storage.record import Missing
-from slam.sequences.continued import recording_of, unused_scans
+from slam.sequences.excerpt import recording_of
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class DepthQuality:
         unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
         if self._unreadable:
             logger.warning("%s, first %s: they are not compared", unreadable, self._unreadable[0])
-        missing = unused_scans(self._sequence) or "the sequence has no true depth (simulated, depth_2 or LiDAR)"
+        missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
         if self._unreadable:
             missing = unreadable
         if self._keyframes == 0:
@@ -73,9 +73,7 @@ def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | Non
     Raises:
         SlamError: a depth map or a scan cannot be read.
     """
-    base, start, first = recording_of(sequence)
-    if index < first:
-        return None
+    base, start = recording_of(sequence)
     frame = start + index
     if getattr(base, "street", None) is not None and count % _EVERY_RENDERED != 1:
         return None

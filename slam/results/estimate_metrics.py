@@ -44,7 +44,6 @@ from slam.results.metrics import (
 from slam.runtime.run_files import TRAJECTORIES
 from slam.runtime.storage.record import Missing
 from slam.runtime.timing import Stopwatch, peak_rss_mb
-from slam.sequences.continued import unused_scans
 
 _NO_TRUTH = Missing("the sequence has no true poses")
 _BY_MAPS = Missing("maps of keyframes give the poses, not steps from frame to frame")
@@ -62,7 +61,7 @@ def estimate_metrics(
         reason="the run has not ended, or was killed while it made the map or the report",
         provenance=provenance,
         sequence=_sequence(result, sequence),
-        timing=timing_of(result.stopwatch, len(sequence) - result.first),
+        timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
         agreement=[AgreementMetrics(**asdict(each)) for each in result.agreements],
         confidence=ConfidenceMetrics(run=sure if isinstance(sure, float) else Missing(sure.reason)),
@@ -131,7 +130,6 @@ def _sequence(result: Estimate, sequence: Sequence) -> SequenceMetrics:
         bridged=_stretches(drive.interpolated),
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
-        continued_at=result.first,
         segments=[Stretch(**asdict(segment)) for segment in drive.segments],
     )
 
@@ -147,7 +145,7 @@ def _lidar_metrics(result: Estimate, sequence: Sequence) -> TrajectoryMetrics | 
     if isinstance(path, MeasurementFailure):
         return Missing(path.reason)
     if path is None or lidar is None:
-        return Missing(unused_scans(sequence) or "the sequence has no LiDAR scans")
+        return Missing("the sequence has no LiDAR scans")
     reference = None if result.reference is None else result.reference.select(path.frames).rebased()
     return trajectory_metrics(lidar, reference)
 
@@ -201,7 +199,7 @@ def _tracking(result: Estimate) -> TrackingMetrics | Missing:
 
 def _depth_error(result: Estimate) -> list[LearnedDepthError] | Missing:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
-    curve, unit = result.state.odometry.depth_error.curve(), float(np.median(result.scale.per_frame))
+    curve, unit = result.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
         return Missing("no step triangulated corners with learned depth")
     return [LearnedDepthError(depth=unit * at, bias=b, sigma=s, corners=count) for at, b, s, count in curve]

@@ -5,20 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from erfsfm.common.lock import FolderLock
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.metrics import Metrics
-from slam.results.output_folder import claim, reclaim, replace_run, stamped, whole_place
+from slam.results.output_folder import claim, stamped
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, trajectory_file
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import MISSING, Missing
-
-if TYPE_CHECKING:
-    from slam.frontend.drive import Keyframe
 
 logger = logging.getLogger(__name__)
 
@@ -26,22 +23,15 @@ logger = logging.getLogger(__name__)
 class RunFolder:
     """The files of one run, under the names of the contract (``docs/run-folder.md``)."""
 
-    def __init__(self, path: str | Path, replaces: Path | None = None) -> None:
-        """A folder that exists, such as ``results/latest``.
-
-        Args:
-            path: where its files are.
-            replaces: the folder of an earlier run, which `publish` replaces by this one.
-        """
+    def __init__(self, path: str | Path) -> None:
+        """A folder that exists, such as ``results/latest``."""
         self.path = Path(path)
-        self.replaces = replaces
 
     @classmethod
     def create(cls, output: Path | None, results: Path, sequence: str, lock: FolderLock | None = None) -> RunFolder:
         """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` linked to it.
 
-        Where ``output`` holds an earlier run, the new one is written to ``output/unfinished`` until `publish`. A
-        ``lock`` holds it from now on.
+        Where ``output`` holds an earlier run, that is removed. A ``lock`` holds the folder from now on.
 
         Raises:
             RunError: ``output`` exists and holds something else than a run, or the folder cannot be made.
@@ -55,18 +45,11 @@ class RunFolder:
                 return folder
             if lock is not None:
                 lock.take(output)
-            place = claim(output)
-            return cls(place, None if place == output else output)
+            claim(output)
+            return cls(output)
         except OSError as error:
             where = output if output is not None else results
             raise RunError(f"no run folder can be made in {where}: {error.strerror or error}") from error
-
-    @classmethod
-    def resume(cls, path: Path) -> RunFolder:
-        """The folder of a run that did not end, to go on in it."""
-        reclaim(path)
-        place = whole_place(path)
-        return cls(path, None if place == path else place)
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
@@ -89,20 +72,6 @@ class RunFolder:
         if metrics.failure:
             logger.warning("%s: %s: files that are there are whole", path, metrics.failure)
         return folder, metrics
-
-    def publish(self) -> None:
-        """Replace the earlier run, if there is one.
-
-        Raises:
-            RunError: a file cannot be moved or removed.
-        """
-        if self.replaces is None:
-            return
-        try:
-            replace_run(self.replaces, self.path)
-        except OSError as error:
-            raise RunError(f"the run in {self.replaces} cannot be replaced: {error.strerror or error}") from error
-        self.path, self.replaces = self.replaces, None
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file atomically."""
@@ -144,21 +113,6 @@ class RunFolder:
     def cloud(self) -> Any:
         """The map as an Open3D ``PointCloud``, y down; `RunError` where the run has none."""
         return import_open3d().io.read_point_cloud(str(self.require(MAP_CLOUD)))
-
-    def keyframes(self) -> dict[int, Keyframe]:
-        """Images and depth of the map's keyframes by frame; needs ``output.keep=keyframes``.
-
-        Depth is unscaled: ``metrics().scale.value`` takes it to the unit of the run, but for drift.
-
-        Raises:
-            RunError: the run kept none.
-        """
-        from slam.pipeline.checkpoint import SessionCheckpoint
-
-        found = {keyframe.index: keyframe for keyframe in SessionCheckpoint.open(self.path).state.drive.keyframes}
-        if not found:
-            raise RunError(f"{self.path} kept no keyframes: run with --set output.keep=keyframes")
-        return found
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

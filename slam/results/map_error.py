@@ -17,7 +17,7 @@ from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.pipeline.estimate import Estimate
 from slam.results.metrics import MapErrors
 from slam.runtime.errors import SlamError
-from slam.sequences.continued import recording_of, unused_scans
+from slam.sequences.excerpt import recording_of
 
 logger = logging.getLogger(__name__)
 
@@ -40,13 +40,12 @@ class HasTrueDepth(Protocol):
 class DepthTruth:
     """Depth maps at true poses; ``distance`` is exact where the surface itself is known."""
 
-    def __init__(self, sequence: Sequence, depth: HasTrueDepth, start: int, first: int) -> None:
-        """Depth of a sequence, from its frame ``first`` on, whose frame 0 is frame ``start`` of ``depth``."""
+    def __init__(self, sequence: Sequence, depth: HasTrueDepth, start: int) -> None:
+        """Depth of a sequence whose frame 0 is frame ``start`` of ``depth``."""
         self._depth, self._start = depth, start
         self._intrinsics, self._poses = sequence.intrinsics, sequence.reference
-        self._is_part = first > 0
         frames = np.asarray(depth.true_depth_frames(), dtype=np.int64) - start
-        self.frames: Indices = frames[(frames >= first) & (frames < len(sequence))]
+        self.frames: Indices = frames[(frames >= 0) & (frames < len(sequence))]
         exact, T_any_camera = getattr(depth, "distance_to_surface", None), getattr(depth, "T_any_camera", None)
         self.name = "depth maps" if exact is None else "exact surface"
         self.distance: Callable[[FloatArray], FloatArray] | None = None
@@ -66,14 +65,8 @@ class DepthTruth:
         return Surface(points, np.linalg.norm(points - self._poses[frame][:3, 3], axis=1) <= RANGE_M)
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:
-        """All, for the map comes from the same images; with earlier ones that have no truth, points in these images."""
-        if not self._is_part:
-            return np.ones(len(points), dtype=bool)
-        assert self._poses is not None
-        found = np.zeros(len(points), dtype=bool)
-        for frame in frames:
-            found |= _in_image(apply(invert(self._poses[frame]), points), self._intrinsics, _DEPTH_RANGE_M)
-        return found
+        """All, for the map comes from the same images."""
+        return np.ones(len(points), dtype=bool)
 
 
 class LidarTruth:
@@ -104,7 +97,7 @@ class LidarTruth:
         ranges = np.linalg.norm(points, axis=1)
         self._limits[frame] = _elevations(points, ranges)
         points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
-        return Surface(apply(sequence.reference[frame], points), _in_image(points, sequence.intrinsics, np.inf))
+        return Surface(apply(sequence.reference[frame], points), _in_image(points, sequence.intrinsics))
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:
         """Points within 25 m of a scanner, between its lowest and its highest beam."""
@@ -123,9 +116,9 @@ class LidarTruth:
         return found
 
 
-def _in_image(points: FloatArray, camera: Intrinsics, furthest_m: float) -> Mask:
+def _in_image(points: FloatArray, camera: Intrinsics) -> Mask:
     """Which points of a camera ``(P, 3)`` project into its image."""
-    inside = (points[:, 2] > NEAREST_M) & (points[:, 2] <= furthest_m)
+    inside: Mask = points[:, 2] > NEAREST_M
     pixels = camera.project(points[inside])
     inside[inside] = ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
     return inside
@@ -144,17 +137,16 @@ def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     """The best truth of a sequence, or why there is none."""
     if sequence.reference is None:
         return "the sequence has no true poses"
-    base, start, first = recording_of(sequence)
+    base, start = recording_of(sequence)
     if isinstance(base, HasTrueDepth):
-        depth = DepthTruth(sequence, base, start, first)
+        depth = DepthTruth(sequence, base, start)
         if len(depth.frames):
             return depth
     if sequence.T_camera_lidar is not None:
         lidar = LidarTruth(sequence)
         if len(lidar.frames):
             return lidar
-    why = unused_scans(sequence) or "there are neither depth maps nor LiDAR scans beside the images"
-    return f"the true surface is not known: {why}"
+    return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
 
 
 def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> MapErrors:

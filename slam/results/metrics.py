@@ -65,7 +65,6 @@ class SequenceMetrics(Record):
     bridged: Known[list[Stretch]] = MISSING
     doubled: Known[list[Stretch]] = MISSING
     unreadable_scans: Known[list[Stretch]] = MISSING
-    continued_at: Known[Count] = MISSING
     segments: Known[list[Stretch]] = MISSING
 
 

@@ -6,9 +6,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from slam.formats.trajectory import read_trajectory
-from slam.results.output_folder import is_own
 from slam.runtime.errors import RunError, TrajectoryError
-from slam.runtime.run_files import ESTIMATE, METRICS
+from slam.runtime.run_files import ESTIMATE, MEANINGS, METRICS
 
 _TRAJECTORIES = (".txt", ".tum", ".kitti")
 
@@ -46,7 +45,7 @@ def _must_be_known(path: Path, suffixes: Collection[str]) -> bool:
     """Whether there is a file whose content must be looked at."""
     if path.is_dir():
         raise RunError(f"{path} is a folder: give the name of a file to write")
-    if is_own(path.name) and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
+    if path.name in MEANINGS and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
         raise RunError(f"{path} is a file of a run: choose another --output")
     if not path.is_file() or not path.stat().st_size:
         return False

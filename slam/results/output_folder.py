@@ -1,4 +1,4 @@
-"""The output folder of a run: ``--output`` itself, or a folder in it while it still holds an earlier run.
+"""The output folder of a run: ``--output``, or a new one in ``results``.
 
 Only files of a run are ever removed, and only from a folder whose ``metrics.json`` is that of a run.
 """
@@ -8,16 +8,14 @@ from __future__ import annotations
 import logging
 import os
 import re
-import shutil
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
-from erfsfm.common.files import unfinished_name, write_atomically
-from slam.mapping.submap import remove_submaps
+from erfsfm.common.files import unfinished_name
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
-from slam.runtime.run_files import ESTIMATE, KEYFRAMES_PART, MEANINGS, METRICS, SUBMAPS, UNFINISHED
+from slam.runtime.run_files import MEANINGS, METRICS
 from slam.runtime.storage.record import Missing
 
 logger = logging.getLogger(__name__)
@@ -40,55 +38,22 @@ def check_output(output: Path) -> None:
     if not _is_run(output / METRICS) and any(not _is_rest(path) for path in output.iterdir()):
         raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
     for path in output.iterdir():
-        if is_own(path.name) and path.is_dir():
+        if path.name in MEANINGS and path.is_dir():
             raise RunError(f"{path} is a folder, where a run writes a file: move it away, or choose another --output")
 
 
-def claim(output: Path) -> Path:
-    """Make the folder of a new run, without files of earlier ones.
-
-    It is ``output``, or ``output/unfinished`` where the trajectories of an earlier run are whole: they stay until
-    `replace_run`.
+def claim(output: Path) -> None:
+    """Make the folder of a new run, without files of earlier ones; other files stay.
 
     Raises:
         RunError: as `check_output`.
         OSError: the folder cannot be made.
     """
     check_output(output)
-    place = output / UNFINISHED if (output / ESTIMATE).is_file() else output
-    check_output(place)
-    place.mkdir(parents=True, exist_ok=True)
-    _clear(place)
-    return place
-
-
-def whole_place(folder: Path) -> Path:
-    """Where a run will be once it is whole."""
-    return folder.parent if folder.name == UNFINISHED and (folder.parent / ESTIMATE).is_file() else folder
-
-
-def reclaim(output: Path) -> None:
-    """Go on in the folder of a run that did not end: its files stay, what a killed process was writing goes."""
-    for path in output.iterdir():
-        if _is_rest(path):
+    output.mkdir(parents=True, exist_ok=True)
+    for path in sorted(output.iterdir(), key=lambda path: path.name == METRICS):  # by which it is known as a run
+        if path.name in MEANINGS or _is_rest(path):
             path.unlink()
-
-
-def replace_run(output: Path, place: Path) -> None:
-    """Put the run in ``place`` (``output/unfinished``) in place of the one in ``output``.
-
-    Old files are removed before new ones are moved. Both folders have a ``metrics.json`` until the end, so that the
-    next run recognises them as runs and replaces them, wherever this was interrupted.
-    """
-    write_atomically(output / METRICS, lambda path: shutil.copyfile(place / METRICS, path))
-    remove_submaps(output / SUBMAPS)
-    for path in _files(output):
-        if path.name != METRICS:
-            path.unlink()
-    for path in sorted(_files(place), key=lambda path: path.name == METRICS):
-        path.replace(output / path.name)
-    with suppress(OSError):  # it holds other files
-        place.rmdir()
 
 
 def stamped(results: Path, sequence: str) -> Path:
@@ -126,29 +91,7 @@ def _is_run(metrics: Path) -> bool:
 
 def _is_rest(path: Path) -> bool:
     """Whether it is a partial file of a killed run."""
-    name = unfinished_name(path)
-    return name is not None and is_own(name)
-
-
-def _files(folder: Path) -> list[Path]:
-    """Files of a run, whole or partial."""
-    return [path for path in folder.iterdir() if is_own(path.name) or _is_rest(path)]
-
-
-def is_own(name: str) -> bool:
-    """Whether a run writes a file of this name."""
-    return name in MEANINGS or KEYFRAMES_PART.fullmatch(name) is not None
-
-
-def _clear(folder: Path) -> None:
-    """Remove an earlier run with its partial files; other files stay."""
-    check_output(folder / UNFINISHED)
-    remove_submaps(folder / SUBMAPS)
-    for path in _files(folder):
-        path.unlink()
-    if (folder / UNFINISHED).is_dir():
-        _clear(folder / UNFINISHED)
-        (folder / UNFINISHED).rmdir()
+    return unfinished_name(path) in MEANINGS
 
 
 def _link(link: Path, target: Path) -> None:

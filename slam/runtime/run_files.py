@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import re
-
 CONFIG = "config.yaml"
 METRICS = "metrics.json"
 GRAPH = "graph.g2o"
 LOOPS = "loops.json"
 PLACES = "places.npz"
-DRIVE = "drive.zip"
-KEYFRAMES = "keyframes.npz"
 MAP_MESH = "map_mesh.ply"
 MAP_CLOUD = "map_cloud.ply"
 REPORT = "report.html"
 LOG = "run.log"
-
-KEYFRAMES_PART = re.compile(r"keyframes-\d{6,}\.npz")  # some keyframes of a pass that has not ended
-SUBMAPS = "submaps"  # folder of the parts of a map that is not whole
-UNFINISHED = "unfinished"  # folder of a new run while an earlier one is kept
 
 REFERENCE = "reference"
 TRAJECTORIES = {
@@ -43,8 +35,6 @@ MEANINGS = {
     GRAPH: "pose graph",
     LOOPS: "accepted and rejected loops",
     PLACES: "features of places, for localize",
-    DRIVE: "measurements of every frame, for run --continue",
-    KEYFRAMES: "keyframes of the map, for run --continue",
     MAP_MESH: "map as a mesh, y down",
     MAP_CLOUD: "map as a coloured cloud, y down",
     REPORT: "this page",

@@ -67,9 +67,14 @@ class Excerpt:
         return labels(self.sources, len(self))
 
 
+def recording_of(sequence: Sequence) -> tuple[Sequence, int]:
+    """The recording of a sequence, and which frame of it frame 0 is."""
+    return (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
+
+
 def undistortion_of(recording: Sequence) -> Undistortion | None:
     """What a recording does with its images as it reads them; None where they have no distortion."""
-    base = recording.base if isinstance(recording, Excerpt) else recording
+    base, _ = recording_of(recording)
     images = base.images if isinstance(base, RecordedSequence) else None
     return images.undistortion if isinstance(images, UndistortedImages) else None
 

@@ -9,7 +9,7 @@ from erfsfm.common.readers.numbering import NumberedFiles
 from slam.frames import Image
 from slam.runtime.errors import MissingFrameError, SequenceError
 
-MAX_GAP_FRAMES = 100
+_MAX_GAP_FRAMES = 100
 
 
 class ImageSource(Protocol):
@@ -37,7 +37,7 @@ class ImageFiles:
         """
         self.files = files
         for first, last in files.gaps():
-            if last - first + 1 > MAX_GAP_FRAMES:
+            if last - first + 1 > _MAX_GAP_FRAMES:
                 raise too_long(files, first, last)
         self._paths = dict(zip(files.rows, files.paths))
         self._stretch = stretch_of(files.paths)

@@ -32,7 +32,7 @@ from slam.sequences.undistortion import calibrated
 
 logger = logging.getLogger(__name__)
 
-MAX_GAP_S = 10.0
+_MAX_GAP_S = 10.0
 POSSIBLE_PERIODS_S = (1e-5, 1e4)  # stamps in nanoseconds or microseconds give more
 _USUAL_PERIODS_S = (1e-3, 5.0)
 _RIGID_TOLERANCE = 0.01
@@ -302,7 +302,7 @@ def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:
         SequenceError: if a gap is longer than 10 seconds.
     """
     for first, last in files.gaps():
-        if stamps[last + 1] - stamps[first - 1] > MAX_GAP_S:
+        if stamps[last + 1] - stamps[first - 1] > _MAX_GAP_S:
             raise too_long(files, first, last)
     if files.gaps():
         logger.warning("%s: %s; the motion across gaps is interpolated", files.paths[0].parent, files.describe_gaps())

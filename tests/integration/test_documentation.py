@@ -52,7 +52,6 @@ SHORTER: tuple[tuple[str, str], ...] = (
     # (pattern, replacement), applied to the whole command line one after another
     (r"^erfsfm-slam run(?!.*(--dataset|--sequence|--frames))", r"\g<0> --frames 0:12"),
     (r"--frames 0:900\b", f"--frames 0:{FIRST_RUN}"),
-    (r"--frames 900:", f"--frames {FIRST_RUN}:"),
     (r"^erfsfm-slam simulate .*", rf"\g<0> --width {WIDTH} --height {HEIGHT}"),
     (r"^(erfsfm-slam simulate .*)--route loop --frames \d+", r"\1--route straight --frames 12"),
     (r"^(erfsfm-slam simulate .*)--frames \d+", r"\1--frames 12"),

@@ -93,9 +93,9 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
             camera = camera_file_of(info, rectified, DEFAULT_FPS, "camera_info")
             self._undistortion = None if camera.model == "pinhole" else Undistortion(camera)
             intrinsics = self._undistortion.intrinsics if self._undistortion else Intrinsics.of(camera.pinhole)
-            config = load_config(None, ["output.keep=keyframes", *self._of["settings"].split()])
+            config = load_config(None, self._of["settings"].split())
             height_m = self._of["camera_height_m"] or None
-            self._slam = Slam.from_weights(self._of["weights"], intrinsics, config, height_m)
+            self._slam = Slam.from_weights(self._of["weights"], intrinsics, config, height_m, with_map=True)
 
     def add(self, message: Image) -> None:
         """Measure an image and say where it was taken; one that cannot be used is left out and logged."""

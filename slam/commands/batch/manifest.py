@@ -20,7 +20,7 @@ from slam.sequences.excerpt import frame_range
 
 MANIFEST = ".csv"
 _KEYS = ("name", "dataset", "sequence", "camera", "options")
-_OURS = ("--dataset", "--sequence", "-s", "--camera", "--output", "--continue", "--json")
+_OURS = ("--dataset", "--sequence", "-s", "--camera", "--output", "--json")
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,20 +12,15 @@ from slam.commands.exports.colmap import write_model
 from slam.commands.exports.nerfstudio import write_scene
 from slam.commands.exports.occupancy import occupancy_grid
 from slam.commands.exports.parts import R_UP_WORLDS, check_options, check_target
-from slam.config.sections import load_stored
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.formats.trajectory import Trajectory
 from slam.geometry import se3
-from slam.mapping.submap import Submap, submap_paths
-from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError
-from slam.runtime.run_files import CONFIG, ESTIMATE, MAP_CLOUD, MAP_MESH, SUBMAPS
+from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
 from slam.runtime.storage.record import known
-
-logger = logging.getLogger(__name__)
 
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
 _RESOLUTION = 0.1  # of an occupancy grid
@@ -72,11 +63,11 @@ def export(
     check_options(what, up, resolution, dataset, points)
     check_target(folder, what, output)
     if what in _MAPS:
-        write_ply(output, _map(folder, what, up, progress))
+        write_ply(output, _map(folder, what, up))
     elif what == "occupancy":
-        return _export_occupancy(folder, output, resolution or _RESOLUTION, progress)
+        return _export_occupancy(folder, output, resolution or _RESOLUTION)
     else:
-        trajectory, cloud = _trajectory(folder, up), _cloud(folder, up, progress)
+        trajectory, cloud = _trajectory(folder, up), _cloud(folder, up)
         if what == "colmap":
             write_model(folder, output, trajectory, R_UP_WORLDS[up], cloud, dataset, points, progress)
         else:
@@ -84,48 +75,28 @@ def export(
     return output
 
 
-def _export_occupancy(folder: RunFolder, output: Path, resolution: float, progress: Progress) -> Path:
+def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Path:
     unit = folder.metrics().unit
     if unit not in (METRES, CAMERA_HEIGHTS):
         raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
-    mesh, trajectory = _map(folder, "mesh", "z", progress), _trajectory(folder, "z")
+    mesh, trajectory = _map(folder, "mesh", "z"), _trajectory(folder, "z")
     grid = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
     written = output.with_suffix(".yaml")
     write_ros_map(written, grid.cells, grid.corner, grid.resolution, unit)
     return written
 
 
-def _cloud(folder: RunFolder, up: str, progress: Progress) -> Ply | None:
-    """The cloud of the map, None where the run has neither it nor submaps of which it can be made."""
-    if not (folder.path / MAP_CLOUD).is_file() and not submap_paths(folder.path / SUBMAPS):
-        return None
-    return _map(folder, "cloud", up, progress)
+def _cloud(folder: RunFolder, up: str) -> Ply | None:
+    """The cloud of the map, None where the run has none."""
+    return _map(folder, "cloud", up) if (folder.path / MAP_CLOUD).is_file() else None
 
 
-def _map(folder: RunFolder, what: str, up: str, progress: Progress) -> Ply:
+def _map(folder: RunFolder, what: str, up: str) -> Ply:
     """The mesh or cloud of the map in the given axes."""
-    with _map_file(folder, what, progress) as source:
-        ply = read_ply(source)
+    ply = read_ply(folder.require(_MAPS[what]))
     if len(ply.vertices) == 0 or (ply.triangles is not None and len(ply.triangles) == 0):
         raise RunError("the map is empty: there is nothing to export")
     return ply if up == "y-down" else rotated(ply, R_UP_WORLDS[up])
-
-
-@contextmanager
-def _map_file(folder: RunFolder, what: str, progress: Progress) -> Iterator[Path]:
-    """The ``mesh`` or ``cloud`` as a PLY file, which may be gone afterwards; of a killed run that of its submaps."""
-    paths = submap_paths(folder.path / SUBMAPS)
-    if (folder.path / _MAPS[what]).is_file() or not paths:
-        yield folder.require(_MAPS[what])
-        return
-    logger.warning("%s has no whole map: its %d finished submaps are used", folder.path, len(paths))
-    settings = load_stored(folder.require(CONFIG), "mapping").mapping
-    voxel_size = float(Submap.read(paths[0]).voxel_size)  # which follows the scene where no metres were known
-    surface = MapSurface(paths, settings.in_unit(voxel_size / settings.voxel_size_m), progress)
-    with tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-") as temporary:
-        path = Path(temporary) / _MAPS[what]
-        (surface.write_mesh if what == "mesh" else surface.write_cloud)(path)
-        yield path
 
 
 def _trajectory(folder: RunFolder, up: str) -> Trajectory:

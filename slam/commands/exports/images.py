@@ -23,7 +23,6 @@ from slam.runtime.storage.files import remove, write_atomically
 from slam.runtime.storage.record import Missing, known
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import frame_range
 
 logger = logging.getLogger(__name__)
 
@@ -110,21 +109,8 @@ def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) 
 
 
 def _rows(folder: RunFolder, trajectory: Trajectory, sequence: Sequence) -> list[int | None]:
-    """Frames by their stamps; by their order where the recording continues another and its stamps were shifted."""
-    metrics, stamps = folder.metrics(), np.asarray(sequence.stamps)
-    first = known(metrics.sequence.continued_at)
-    if first:
-        named = known(metrics.provenance.recording.frames)
-        start, stop = frame_range(named or ":", len(stamps))
-        added = trajectory.stamps[first:]
-        last = stamps[start:stop][-len(added) :]
-        if len(last) != len(added) or np.abs(last - added).max() >= _SAME_STAMP_S:
-            if stop - start != len(added):
-                raise RunError(
-                    f"{sequence.name} has {stop - start} frames, but {folder.path} goes on with {len(added)} at frame "
-                    f"{first}: give the data set of its last part, as it was"
-                )
-            return [None] * first + list(range(start, stop))
+    """Frames by their stamps."""
+    stamps = np.asarray(sequence.stamps)
     nearest = nearest_stamps(trajectory.stamps, stamps)
     same = np.abs(stamps[nearest] - trajectory.stamps) < _SAME_STAMP_S
     if not same.any():

@@ -32,7 +32,6 @@ from slam.pipeline.input_checks import require_possible
 from slam.pipeline.live_poses import LivePoses
 from slam.pipeline.observer import Observer
 from slam.prediction.assembly import make_predictor, open_depth
-from slam.prediction.depth_source import mixed_sha256
 from slam.results.folder import RunFolder
 from slam.results.output_folder import check_output
 from slam.results.run_log import run_log
@@ -101,8 +100,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     )
     provenance = provenance_of(recorded, networks, sequence, depth)
     stream = Stream(sequence.frames, session.watch, session.finish, session.tracked)
-    sha256 = mixed_sha256(networks.sha256, depth)
-    return Job(settings, sequence, pipeline, provenance, sha256, None, stream=stream), sequence
+    return Job(settings, sequence, pipeline, provenance, stream=stream), sequence
 
 
 _DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"

@@ -20,11 +20,8 @@ from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
 from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
-from slam.mapping.submap import remove_submaps
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.observer import Observer
 from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
@@ -38,14 +35,13 @@ from slam.results.report.rendering import Picture
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
 from slam.runtime.attempt import attempt
-from slam.runtime.errors import EmptyMapError, RunError, SlamError
-from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES, SUBMAPS
+from slam.runtime.errors import EmptyMapError, SlamError
+from slam.runtime.run_files import CONFIG, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
 from slam.runtime.storage.record import Missing
-from slam.sequences.continued import Continued
 
 logger = logging.getLogger(__name__)
 
-_NO_KEYFRAMES = "no keyframe was kept before the run was interrupted (output.keep=keyframes)"
+_NO_KEYFRAMES = "no frame for the map has depth"
 
 
 @dataclass(frozen=True)
@@ -70,15 +66,9 @@ class Job:
     recording: FrameSequence
     pipeline: SlamPipeline
     provenance: Provenance
-    predictors_sha256: str
-    checkpoint: SessionCheckpoint | None
     rerun: Path | None = None
     progress: Progress = silent
     stream: Stream | None = None
-
-    def checkpoint_of(self, state: FrontEndState) -> SessionCheckpoint:
-        """The state of this run after some of its frames, which is kept."""
-        return SessionCheckpoint.of(self.recording, state, self.predictors_sha256)
 
 
 def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[[], None]) -> RunFolder:
@@ -95,10 +85,6 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
     except BaseException as error:
         ignore_signals()
         _leave_failure(job, folder, log, error)
-        if folder.replaces is not None and isinstance(error, SlamError):
-            is_kept = (folder.replaces / ESTIMATE).is_file()  # else it failed while one was put in the other's place
-            kept = f"{folder.replaces} {'keeps' if is_kept else 'lost'} its earlier run, this one is in {folder.path}"
-            raise RunError(f"{error}; {kept}") from error
         raise
     return folder
 
@@ -106,18 +92,13 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
 def _run(job: Job, folder: RunFolder) -> None:
     """Estimate, then map, then report; each is on disk before the next begins."""
     folder.write_text(CONFIG, dump_yaml(job.settings))
-    stream, checkpoints = job.stream, _checkpoints(job, folder.path)
+    stream = job.stream
     frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
-    goes_on = not isinstance(job.recording, Continued)  # not in a folder without the images before its own
-    kept = checkpoints if goes_on else None
-    estimate = job.pipeline.estimate(kept, frames, watch, folder.write_trajectory)
+    estimate = job.pipeline.estimate(frames, watch, folder.write_trajectory)
     _write_estimate(folder, estimate, job)
-    if checkpoints is not None:
-        checkpoints.finish(estimate.state)
     with estimate.stopwatch.stage("evaluation"):
         metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
-    folder.publish()
     if stream is not None:
         stream.finish(estimate, folder.path)
     quality, depths = DepthQuality(job.recording, estimate.scale.is_metric), DepthPictures(len(job.recording))
@@ -128,13 +109,13 @@ def _run(job: Job, folder: RunFolder) -> None:
             quality.add(keyframe)
 
     def mapped() -> tuple[Estimate, MapMetrics]:
-        result = replace(estimate, map=job.pipeline.fuse(estimate, compare, folder.path))
+        result = replace(estimate, map=job.pipeline.fuse(estimate, compare))
         return result, _write_map(folder, result, job)
 
     found = attempt("the map", mapped)
     result, map_metrics = (estimate, MapMetrics.missing(found.reason)) if isinstance(found, Missing) else found
     depth = quality.metrics(job.settings.depth.refine != "none")
-    timing = timing_of(result.stopwatch, len(job.recording) - result.first)
+    timing = timing_of(result.stopwatch, len(job.recording))
     metrics = metrics.changed(timing=timing, depth=depth, map=map_metrics)
     folder.write_metrics(metrics)
     metrics = metrics.changed(status="ok", reason=None)
@@ -166,16 +147,6 @@ def _loop_pictures(result: Estimate, job: Job) -> list[Picture]:
     return loop_pictures(result.loops.accepted, image, job.recording.intrinsics, thresholds)
 
 
-def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
-    """What keeps the drive for runs that go on; None where the configuration says so."""
-    keep, before = job.settings.output.keep, job.checkpoint
-    if keep == "nothing":
-        return None
-    is_here = before is not None and not isinstance(job.recording, Continued)
-    kept = before.state.drive if before is not None and is_here else None
-    return CheckpointWriter(folder, job.checkpoint_of, keep == "keyframes", kept)
-
-
 def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
     """What the pass over the frames did not write yet: trajectories by loops and graph, these, and places."""
     for name in ("odometry", "optimised"):
@@ -190,10 +161,7 @@ def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
 
 
 def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
-    """Merge the submaps, write mesh and cloud, and give the metrics of the map; an empty map gives a reason.
-
-    Finished submaps stay where a file cannot be written.
-    """
+    """Merge the submaps, write mesh and cloud, and give the metrics of the map; an empty map gives a reason."""
     if result.map is None:
         mapped = job.settings.mapping.enabled
         return MapMetrics.missing(_NO_KEYFRAMES if mapped else "fusion is switched off (mapping.enabled)")
@@ -202,7 +170,6 @@ def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
             surface = result.map.surface(job.progress)
     except EmptyMapError as error:
         logger.warning("no map: %s", error)
-        remove_submaps(folder.path / SUBMAPS)
         return MapMetrics.missing(str(error))
     job.progress("map files", 0, 1)
     with result.stopwatch.stage("mesh"):
@@ -211,7 +178,6 @@ def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
     with result.stopwatch.stage("evaluation"):
         share = double_wall_share(surface.meshes()) if result.scale.is_metric else Missing("lengths are not in metres")
         errors = map_errors(lambda: (Ply(piece).points for piece in surface.cloud_pieces()), result, job.recording)
-    remove_submaps(folder.path / SUBMAPS)
     job.progress("map files", 1, 1)
     return MapMetrics(**asdict(result.map.statistics()), double_wall_share=share, **dict(errors))
 

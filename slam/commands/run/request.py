@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +14,7 @@ from slam.runtime.errors import RunError
 from slam.runtime.storage.files import from_anywhere
 
 if TYPE_CHECKING:
-    from slam.results.metrics import Provenance, Recording
+    from slam.results.metrics import Recording
 
 _RECORDING = ("dataset", "camera", "gps", "sequence", "frames", "truth")
 _TEXTS = ("weights", "config")  # names, or paths
@@ -51,14 +51,8 @@ class RunRequest:
     )
     output: Output = None
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None
-    continues: Annotated[
-        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
-    ] = None
-    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: that of the old run")] = None
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, max=LARGEST_SEED, help="of every random draw; default: 0, or that of the old run"),
-    ] = None
+    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA")] = None
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="of every random draw")] = 0
     device: Device = "auto"
     progress: Progress | None = None
     command: str = "slam.run_slam"
@@ -83,7 +77,7 @@ class RunRequest:
             request = TypeAdapter(cls).validate_python(arguments)
         except ValidationError as error:
             raise RunError(f"run_slam: {first_problem(error)}") from error
-        if request.seed is not None and not 0 <= request.seed <= LARGEST_SEED:
+        if not 0 <= request.seed <= LARGEST_SEED:
             raise RunError(f"run_slam: seed: should be from 0 to {LARGEST_SEED}; got {request.seed}")
         return request
 
@@ -99,14 +93,3 @@ class RunRequest:
             if value is not None
         }
         return Recording(**texts)
-
-    def resumed(self, before: Provenance, place: Path) -> RunRequest:
-        """The request of a run that did not end, to go on in its folder with what it was run on."""
-        from slam.runtime.storage.record import known
-
-        recording = known(before.recording)
-        named = dict.fromkeys(_RECORDING) | ({} if recording is None else recording.tree())
-        weights = (known(before.weights) or "default") if self.weights == "default" else self.weights
-        seed = known(before.seed) if self.seed is None else self.seed
-        again = replace(self, weights=weights, seed=seed, output=place, continues=None)
-        return RunRequest.of(**vars(again) | named)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.f
 
 
 @dataclass
-class KeyframeOdometryState:
+class _State:
     """Maps of a drive so far; of the last one, what continues: places of the keyframe's corners ``(M, 2)``, poses."""
 
     segments: list[MapSegment] = field(default_factory=list)
@@ -61,12 +61,6 @@ class KeyframeOdometryState:
     small: SmallImage = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
 
-    def copy(self) -> KeyframeOdometryState:
-        """A snapshot, which stays while frames follow."""
-        segments = [segment.copy() for segment in self.segments]
-        places, slipped, events = self.places.copy(), self.slipped.copy(), self.events.copy()
-        return replace(self, segments=segments, places=places, slipped=slipped, events=events)
-
 
 class KeyframeOdometry:
     """Poses of the frames of one sequence in the unit of each segment's map."""
@@ -76,10 +70,9 @@ class KeyframeOdometry:
         config: KeyframesConfig,
         intrinsics: Intrinsics,
         seed: int = 0,
-        state: KeyframeOdometryState | None = None,
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
-        """Prepare for the first frame, or resume from a ``state``; ``seed`` is that of RANSAC.
+        """Prepare for the first frame; ``seed`` is that of RANSAC.
 
         ``on_keyframe`` is told of a keyframe before it is adjusted, so that its depth is predicted meanwhile.
         """
@@ -87,17 +80,18 @@ class KeyframeOdometry:
         self._intrinsics = intrinsics
         self._seed = seed
         self._on_keyframe = on_keyframe
-        self._state = KeyframeOdometryState() if state is None else state.copy()
+        self._state = _State()
         self._spread: FloatArray | None = None  # of the points of the last keyframe, once they are looked for
-
-    def state(self) -> KeyframeOdometryState:
-        """A snapshot to resume from."""
-        return self._state.copy()
 
     @property
     def segments(self) -> Sequence[MapSegment]:
         """The maps so far, which grow with the frames."""
         return self._state.segments
+
+    @property
+    def events(self) -> Sequence[TrackingEvent]:
+        """What became of the maps so far."""
+        return self._state.events
 
     def lost_map(self) -> MapSegment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""

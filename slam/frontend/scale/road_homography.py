@@ -78,9 +78,8 @@ class RoadHomography:
     short and wide one is used, which ends before such a car; it is less accurate.
     """
 
-    def __init__(self, config: RoadConfig, intrinsics: Intrinsics, directions: tuple[FloatArray, ...] = ()) -> None:
-        """Prepare for the first step, or resume with the ``directions`` of motion so far (`state`)."""
-        self._config = config
+    def __init__(self, config: RoadConfig, intrinsics: Intrinsics) -> None:
+        """Prepare for the first step."""
         self._intrinsics = intrinsics
         long = _Shape(_FAR_HEIGHTS, _HALF_WIDTH_HEIGHTS, _RELATIVE_SIGMA)
         near = _Shape(config.near_heights, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)
@@ -88,11 +87,7 @@ class RoadHomography:
         self._shapes = long, near
         self._standing: Mask | None = None
         self._strips = self._visible(None)
-        self._directions = directions
-
-    def state(self) -> tuple[FloatArray, ...]:
-        """Directions of motion ``(3,)`` of the last steps."""
-        return self._directions
+        self._directions: tuple[FloatArray, ...] = ()  # of motion, of the last steps
 
     def measure(
         self, previous: Frame, current: Frame, T_previous_current: FloatArray, standing: Mask | None = None

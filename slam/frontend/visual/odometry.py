@@ -32,7 +32,7 @@ from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.visual.step_check import Step, most_credible
-from slam.frontend.visual.tracking import CornerTracker, CornerTrackerState, Tracks
+from slam.frontend.visual.tracking import CornerTracker, Tracks
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
@@ -77,7 +77,6 @@ class OdometryState:
     and the world never did, however many corners it has.
     """
 
-    tracker: CornerTrackerState
     dynamic_mask: DynamicMask
     history: MotionHistory
     depth_error: DepthError
@@ -95,25 +94,24 @@ class VisualOdometry:
         config: VisualOdometryConfig,
         intrinsics: Intrinsics,
         seed: int = 0,
-        state: OdometryState | None = None,
     ) -> None:
-        """Prepare for the first frames, or resume from a ``state``; ``seed`` is that of RANSAC."""
+        """Prepare for the first frames; ``seed`` is that of RANSAC."""
         self._config = config
         self._working = WorkingSize(intrinsics)
         self._intrinsics = intrinsics = self._working.camera
         self._seed = seed
-        self._tracker = CornerTracker(config, None if state is None else state.tracker)
+        self._tracker = CornerTracker(config)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, seed)
-        self._state = state or OdometryState(
-            self._tracker.state(),
+        self._state = OdometryState(
             DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),
             MotionHistory(),
             DepthError(),
         )
 
+    @property
     def state(self) -> OdometryState:
-        """The state to resume from."""
-        return replace(self._state, tracker=self._tracker.state())
+        """After the last motion."""
+        return self._state
 
     def measure(
         self,

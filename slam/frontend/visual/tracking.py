@@ -7,7 +7,7 @@ that are not found there and back, as on other cars, are tracked in the image as
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -54,25 +54,14 @@ class Corners:
     track_ids: NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class CornerTrackerState:
-    """Corners of the last frames by frame index, and the next free track identifier."""
-
-    corners: dict[int, Corners]
-    next_track_id: int = 0
-
-
 class CornerTracker:
     """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
-    def __init__(self, config: VisualOdometryConfig, state: CornerTrackerState | None = None) -> None:
+    def __init__(self, config: VisualOdometryConfig) -> None:
         self._config = config
-        self._state = state or CornerTrackerState({})
+        self._corners: dict[int, Corners] = {}  # of the last frames
+        self._next_track_id = 0
         self._frames_kept = config.rotation_baseline_steps + 2
-
-    def state(self) -> CornerTrackerState:
-        """The state to resume from."""
-        return self._state
 
     def track(
         self,
@@ -85,14 +74,14 @@ class CornerTracker:
 
         The flow between them may be predicted; pixels that are ``standing`` ``(h, w)`` do not belong to the world.
         """
-        corners = self._state.corners.get(previous.index)
+        corners = self._corners.get(previous.index)
         if corners is None:
             corners = self._filled(previous, Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64)), standing)
         forward, kept = self._tracked(previous, current, corners.pixels, predicted_flow)
         if standing is not None:
             kept &= ~nearest(resized_mask(standing, *current.grey.shape[::-1]), forward)
         track_ids = corners.track_ids[kept]
-        if current.index not in self._state.corners:
+        if current.index not in self._corners:
             self._filled(current, Corners(forward[kept], track_ids), standing)
         before, now = corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
         return Tracks(before, now, track_ids, len(kept))
@@ -102,11 +91,11 @@ class CornerTracker:
 
         The function returned does it, in any thread.
         """
-        corners = self._state.corners.get(previous.index)
-        following = min((index for index in self._state.corners if index > previous.index), default=None)
+        corners = self._corners.get(previous.index)
+        following = min((index for index in self._corners if index > previous.index), default=None)
         if corners is None or following is None:
             return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
-        tracked = np.isin(corners.track_ids, self._state.corners[following].track_ids)
+        tracked = np.isin(corners.track_ids, self._corners[following].track_ids)
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
         def find() -> Tracks:
@@ -131,7 +120,7 @@ class CornerTracker:
 
     def _filled(self, frame: Frame, arrived: Corners, standing: Mask | None) -> Corners:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
-        config, next_id = self._config, self._state.next_track_id
+        config, next_id = self._config, self._next_track_id
         pixels, track_ids = arrived.pixels, arrived.track_ids
         room = config.max_corners - len(pixels)
         if room > 0:
@@ -141,9 +130,9 @@ class CornerTracker:
             track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])
             next_id += len(fresh)
         corners = Corners(pixels, track_ids)
-        kept = sorted({*self._state.corners, frame.index})[-self._frames_kept :]
-        known = {**self._state.corners, frame.index: corners}
-        self._state = replace(self._state, corners={index: known[index] for index in kept}, next_track_id=next_id)
+        self._corners[frame.index], self._next_track_id = corners, next_id
+        for index in sorted(self._corners)[: -self._frames_kept]:
+            del self._corners[index]
         return corners
 
     def _flow(

@@ -48,7 +48,6 @@ class Table:
 
 MOST_LOOPS = 40
 _ALIGNMENTS = {"dof6": "6dof", "dof7": "7dof"}
-_STAGES = {"journal": "journal, from which run --continue goes on"}
 _PER_ALIGNMENT = (
     ("ate_rmse_m", "ATE RMSE, m", 3),
     ("t_rel_percent", "t_rel, %", 2),
@@ -244,7 +243,7 @@ def timing(metrics: Metrics) -> Table | None:
         return None
     timed = sum(stages.values())
     total = max(known(metrics.timing.seconds_total) or 0.0, timed, 1e-9)
-    stages = {_STAGES.get(name, name): seconds for name, seconds in stages.items()} | {"between stages": total - timed}
+    stages = stages | {"between stages": total - timed}
     longest = max(*stages.values(), 1e-9)
     rows = [
         [Cell(name), Cell(f"{seconds:.1f} s"), Cell(f"{100 * seconds / total:.0f} %"), _bar(seconds / longest)]

@@ -1,1 +1,1 @@
-"""Storage on disk: atomic files, serialised sessions and spilled arrays."""
+"""Storage on disk: atomic files and spilled arrays."""

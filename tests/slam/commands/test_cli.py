@@ -363,16 +363,3 @@ def test_doctor(call: Call, kitti_root: Path) -> None:
     assert code == 1 and "nowhere" in out.splitlines()[-1]
     code, out, _ = call("doctor", "--dataset", kitti_root, "--camera", "fov=700")
     assert code == 1 and "700" in out.splitlines()[-1]
-
-
-def test_a_continued_run_prints_its_numbers_of_frames(
-    call: Call, kitti_root: Path, tiny_weights: Path, tmp_path: Path
-) -> None:
-    run = ("run", "--dataset", kitti_root, "--sequence", "sim", "--weights", tiny_weights)
-    assert call(*run, *QUICK, "--frames", "0:6", "--output", "begun")[0] == 0
-    code, out, _ = call(*run, "--continue", "begun", "--frames", "6:8", "--output", "on")
-    assert code == 0 and "2 more frames, 8 in all, in " in out
-    assert len((tmp_path / "on" / "trajectory_optimised.kitti.txt").read_text().splitlines()) == 8
-    code, out, err = call(*run, "--continue", "nowhere", "--output", "off")
-    assert (code, out, err.count("\n")) == (1, "", 1) and "nowhere is not a run folder" in err
-    assert not (tmp_path / "off").exists()

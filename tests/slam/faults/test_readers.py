@@ -32,7 +32,6 @@ from slam.formats.ply import read_ply, write_ply
 from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.geometry import se3
 from slam.loops.places import Places
-from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.results.metrics import LoopsFile, Metrics
 from slam.sequences.catalogue import open_sequence
 
@@ -96,8 +95,6 @@ READERS = (
     Reader("metrics.json", "run/metrics.json", Metrics.read),
     Reader("loops.json", "run/loops.json", LoopsFile.read),
     Reader("places.npz", "run/places.npz", Places.read),
-    Reader("drive.zip", "run/drive.zip", SessionCheckpoint.read),
-    Reader("keyframes.npz", "run/keyframes.npz", lambda path: SessionCheckpoint.open(path.parent)),
     Reader("PLY", "mesh.ply", read_ply, lambda ply: bool(np.isfinite(ply.points).all())),
     Reader("model.yaml", "weights/model.yaml", lambda path: load_model(path.parent)),
     Reader("safetensors", "weights/depth.safetensors", lambda path: load_model(path.parent)),
@@ -135,7 +132,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     triangle = np.eye(3)
     write_ply(place / "mesh.ply", coloured_ply(triangle, triangle, triangle, np.array([[0, 1, 2]])))
     _write_old_checkpoint(place / "old.pth.tar")
-    overrides = ["output.keep=keyframes", "output.report=false", "visual_odometry.enabled=false"]
+    overrides = ["output.report=false", "visual_odometry.enabled=false"]
     run_slam(kitti_root, "sim", weights=tiny_weights, output=place / "run", frames="0:8", overrides=overrides)
     return place
 

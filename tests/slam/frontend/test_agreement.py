@@ -23,7 +23,6 @@ from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import OdometryState
-from slam.frontend.visual.tracking import CornerTrackerState
 from slam.geometry import se3
 
 FRAMES = 40
@@ -93,8 +92,8 @@ def driven(
         roads=[MeasurementFailure("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
     )
-    tracker, mask = CornerTrackerState({}), DynamicMask.empty(416, 128, 1.0)
-    state = OdometryState(tracker, mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
+    mask = DynamicMask.empty(416, 128, 1.0)
+    state = OdometryState(mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
     camera = replace(CAMERA, is_guess=is_guess)
     by_frame = agreement.frame_support(range(len(drive)), drive.motions)
     ends = [pose.ends for pose in poses[:contradicted]]

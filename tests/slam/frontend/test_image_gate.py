@@ -131,17 +131,6 @@ def test_a_simulated_stop_is_not_frozen() -> None:
     assert set(verdicts(images)) == {"new"}
 
 
-def test_a_gate_resumes_from_its_state() -> None:
-    images = [*street()[:8], *(jpeg(street()[7], quality) for quality in QUALITIES), *street()[18:]]
-    images[20:24] = [noise(k) for k in range(4)]
-    whole = verdicts(images)
-    assert len(set(whole)) == 3
-    for split in range(len(images)):
-        first = ImageGate()
-        before = verdicts(images[:split], first)
-        assert before + verdicts(images[split:], ImageGate(first.state())) == whole
-
-
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["00", "02", "05"])
 def test_freezes_are_detected_on_real_frames(data_root, name: str) -> None:
@@ -162,6 +151,6 @@ def test_pixels_that_stand_while_the_camera_moves_are_found() -> None:
     for drive in (images, covered, still):
         gate = ImageGate()
         verdicts(drive, gate)
-        found.append(gate.state().standing)
+        found.append(gate.state.standing)
     assert found[0] is None and found[2] is None
     assert found[1] is not None and found[1][12:].all() and not found[1][:10].any()

@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,14 +29,13 @@ def street_map() -> StreetMap:
     """A map of 18 frames, 1 m apart, with images of one grey level each; its unit has ``per_metre`` to a metre."""
 
     def make(
-        folder: Path | None = None,
         grey: Callable[[int], float] = lambda k: 128.0,
         hidden: bool = False,
         per_metre: float = 1.0,
         **config: float,
     ) -> TsdfMap:
         settings = MappingConfig(**{"depth_max_m": 20.0, **config}).in_unit(per_metre)
-        tsdf_map = TsdfMap(settings, CAMERA, folder)
+        tsdf_map = TsdfMap(settings, CAMERA)
         for k in range(18):
             depth = _street(float(k))
             if hidden:  # a hole of the road, 1 m wide, at z = 20

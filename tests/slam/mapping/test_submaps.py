@@ -4,11 +4,8 @@ from collections import Counter
 
 import numpy as np
 
-from slam.config.sections import MappingConfig
-from slam.mapping.merged_submaps import TILE_BLOCKS, MergedSubmaps
-from slam.mapping.submap import BLOCK_SIDE, remove_submaps, submap_paths
-from slam.mapping.surface import MapSurface
-from slam.runtime.run_files import SUBMAPS
+from slam.mapping.merged_submaps import TILE_BLOCKS
+from slam.mapping.submap import BLOCK_SIDE
 
 
 def test_submaps_merge_to_the_surface_of_one(street_map):
@@ -46,13 +43,3 @@ def test_tiles_are_joined_without_a_seam(street_map):
     x = vertices[triangles][..., 0]
     left, right = triangles[x.min(axis=1) < 0], triangles[x.max(axis=1) > 0]
     assert len(np.intersect1d(left, right)) > 50
-
-
-def test_finished_submaps_outlive_the_process_that_made_them(street_map, tmp_path):
-    street_map(tmp_path, submap_m=6.0)  # its last frames are not in a finished submap
-    paths = submap_paths(tmp_path / SUBMAPS)
-    assert len(paths) == 2
-    surface = MapSurface(paths, MappingConfig())
-    assert surface.triangles > 1000 and MergedSubmaps(paths).fused < 18
-    remove_submaps(tmp_path / SUBMAPS)
-    assert list(tmp_path.iterdir()) == []

@@ -1,5 +1,4 @@
-import zipfile
-from pathlib import Path
+import pickle
 
 import cv2
 import numpy as np
@@ -18,8 +17,6 @@ from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
-from slam.pipeline.checkpoint import SERIALISER
-from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
 from slam.pipeline.observer import Observer
 from slam.runtime.timing import Stopwatch
@@ -67,8 +64,8 @@ KEYFRAMES_ALONE = SlamConfig(
 
 
 def completed(observer: Observer) -> Drive:
-    maps = observer.maps()
-    return complete_drive(observer.drive, 4, maps, keyframe_poses(maps, room.INTRINSICS))
+    found = observer.observations()
+    return complete_drive(found.drive, 4, found.maps, keyframe_poses(found.maps, room.INTRINSICS))
 
 
 @pytest.mark.parametrize("stands", [False, True])
@@ -93,7 +90,7 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
 
 @pytest.mark.parametrize("interrupted", [(), (19, 21), (20, 22)])
 def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) -> None:
-    """The same ones where the state is asked for in between."""
+    """The same ones where the observations are asked for in between."""
     truth = room.walk(40)
     predicted: list[int] = []
 
@@ -106,10 +103,9 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
         for k, T in enumerate(truth):
             observer.add(k, room.frame(k, T))
             if k in interrupted:
-                observer.state()
-        state, drive = observer.state(), completed(observer)
-    assert state.keyframes is not None
-    keyframes = state.keyframes.segments[-1].map.keyframes
+                observer.observations()
+        drive = completed(observer)
+    keyframes = drive.maps[-1].map.keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
     assert [k for k in predicted if k >= 20] == [keyframe.index for keyframe in keyframes if keyframe.index >= 20]
     assert [snippet.target for snippet in drive.trusted if snippet.target > 18] == [22, 26, 30, 34]
@@ -130,32 +126,18 @@ def test_opencv_takes_all_cores_for_keyframes_alone(
         assert cv2.getNumThreads() == 1
 
 
-def written(state: FrontEndState, path: Path) -> list[bytes]:
-    SERIALISER.write(path, state)
-    with zipfile.ZipFile(path) as file:
-        return [file.read(name) for name in file.namelist()]
-
-
-def test_a_state_stays_as_it_was_given_out(tmp_path: Path) -> None:
-    """While frames follow, in the front end that gave it out and in another that resumed from it."""
+def test_observations_stay_while_frames_follow() -> None:
     truth = room.walk(40)
     oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
-
-    def observer(state: FrontEndState | None = None) -> Observer:
-        return Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch(), state=state)
-
-    with observer() as first:
+    with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k in range(26):
-            first.add(k, room.frame(k, truth[k]))
-        state = first.state()
-        before = written(state, tmp_path / "before")
-        with observer(state) as second:
-            for k in range(26, 40):
-                first.add(k, room.frame(k, truth[k]))
-                second.add(k, room.frame(k, truth[k]))
-            after = [written(each.state(), tmp_path / "after") for each in (first, second)]
-    assert state.keyframes is not None and state.keyframes.segments[-1].started
-    assert written(state, tmp_path / "again") == before and after[0] == after[1] != before
+            observer.add(k, room.frame(k, truth[k]))
+        found = observer.observations()
+        before = pickle.dumps((found.drive, found.maps, found.events))
+        for k in range(26, 40):
+            observer.add(k, room.frame(k, truth[k]))
+        assert len(observer.observations().drive) == 40
+    assert found.maps and pickle.dumps((found.drive, found.maps, found.events)) == before
 
 
 def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:

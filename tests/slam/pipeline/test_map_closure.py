@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig, SlamConfig
 from slam.frames import RelativeSimilarity, View
+from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
+from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
@@ -37,14 +38,14 @@ def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> Float
 
 
 @functools.cache
-def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometryState]:
+def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometry]:
     """Two maps, and the true poses; on the way back the camera is rolled and closer."""
     walked = there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:30], walked[48:]])
     return truth, room.tracked(CONFIG.keyframes, truth, [0] * 30 + [9] * 9 + [0] * 53)
 
 
-def closed(state: KeyframeOdometryState) -> MapClosure:
+def closed(state: KeyframeOdometry) -> MapClosure:
     maps = [segment for segment in state.segments if segment.started]
     return close_maps(maps, keyframe_poses(maps, room.INTRINSICS), room.INTRINSICS)
 
@@ -108,21 +109,17 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     walked = there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:60], walked[82:]])
     seeds = [0] * 60 + [9] * 6 + [0] * 22
-    tracking = KeyframeTracking(
-        KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, KeyframeOdometryState()
-    )
+    tracking = KeyframeTracking(KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0)
     for k, T in enumerate(truth):
         frame = room.frame(k, T, seeds[k])
         tracking.follow(frame)
         tracking.learn(frame, room.depth_map(T))
-    state = tracking.state()
-    assert state is not None
-    _, lost, found = state.events
+    _, lost, found = tracking.events
     assert (lost.event, lost.frame) == ("lost", 60)
     assert (found.event, found.frame) == ("relocalised", 66)
     assert found.other is not None
     assert found.other < 40
-    poses = keyframe_poses(state.segments, room.INTRINSICS)
+    poses = keyframe_poses(tracking.maps(Drive()), room.INTRINSICS)
     assert set(poses.segments) == {*range(60), *range(66, 88)}
     position, rotation = errors(poses, truth)
     assert position < 0.01
@@ -141,23 +138,14 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
 def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
     places: list[int], unseen: Sequence[int], sparse: Sequence[int], relocalised: list[int]
 ) -> None:
-    """As by a session that is resumed after every frame, and remembers no earlier map."""
     truth = there_and_back(110, roll=0.4, closer=0.3)[places]
-    config = KeyframesConfig(max_corners=400, use="always")
-    going_on, resumed = (
-        KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, KeyframeOdometryState()) for _ in range(2)
-    )
+    tracking = KeyframeTracking(KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0)
     for k, T in enumerate(truth):
-        frame, depth = room.frame(k, T, 9 if k in unseen else 0), room.depth_map(T)
-        for tracking in (going_on, resumed):
-            tracking.follow(frame)
-            if k not in sparse:
-                tracking.learn(frame, depth)
-        resumed = KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, resumed.state())
-    states = going_on.state(), resumed.state()
-    assert states[0] is not None and states[1] is not None
-    assert [each.frame for each in states[0].events if each.event == "relocalised"] == relocalised
-    assert states[0].events == states[1].events
+        frame = room.frame(k, T, 9 if k in unseen else 0)
+        tracking.follow(frame)
+        if k not in sparse:
+            tracking.learn(frame, room.depth_map(T))
+    assert [each.frame for each in tracking.events if each.event == "relocalised"] == relocalised
 
 
 def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,7 +201,7 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
         frame = replace(sequence.frame(k), index=k // 4)
         odometry.follow(frame)
         odometry.learn(frame, flat)
-    maps = odometry.state().segments
+    maps = odometry.segments
     before = keyframe_poses(maps, sequence.intrinsics)
     after = close_maps(maps, before, sequence.intrinsics)
     T_world_camera = np.tile(np.eye(4), (len(truth), 1, 1))

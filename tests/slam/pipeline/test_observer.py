@@ -1,4 +1,4 @@
-"""One pass over the frames: damaged and missing ones are interpolated and reported, and a pass can be resumed."""
+"""One pass over the frames: damaged and missing ones are interpolated and reported."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,9 +22,8 @@ from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.front_end_state import FrontEndState
+from slam.pipeline.observations import Observations
 from slam.pipeline.observer import Observer
 from slam.pipeline.pending import read_frame
 from slam.runtime.errors import MissingFrameError, SequenceError
@@ -209,38 +207,36 @@ def test_an_undamaged_drive_has_no_interpolated_frames(caplog: pytest.LogCapture
     assert result.drive.doubled == [] and "exposure" not in caplog.text
 
 
-def observe(frames: int, state: FrontEndState | None, damage: Damage, bad: range, *overrides: str) -> FrontEndState:
-    """The state after so many frames of a damaged drive, from a state on."""
+def observe(frames: int, damage: Damage, bad: range, *overrides: str) -> Observations:
+    """So many frames of a damaged drive."""
     sequence = Damaged(street(), damage, bad)
     config = config_with("mapping.enabled=false", "visual_odometry.enabled=false", *overrides)
-    with Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state) as observer:
-        for index in range(0 if state is None else len(state.drive.roads), frames):
+    with Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) as observer:
+        for index in range(frames):
             observer.add(index, read_frame(sequence, index))
-        return observer.state()
+        return observer.observations()
 
 
 def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
     """Forty missing in a row are a gap in time; the thirty-first unreadable one is an error."""
-    state = observe(50, None, missing, range(8, 48))
-    assert sorted(state.drive.unusable) == list(range(8, 48)) and state.unread == 0
-    state = observe(38, None, unreadable, range(8, 48))
-    assert sorted(state.drive.unusable) == list(range(8, 38)) and state.unread == 30
+    assert sorted(observe(50, missing, range(8, 48)).drive.unusable) == list(range(8, 48))
+    assert sorted(observe(38, unreadable, range(8, 48)).drive.unusable) == list(range(8, 38))
     with pytest.raises(SequenceError, match=r"image 38\.png is truncated"):
-        observe(39, state, unreadable, range(8, 48))
+        observe(39, unreadable, range(8, 48))
 
 
 def test_missing_images_between_unreadable_ones_are_not_counted() -> None:
     def either(sequence: SimulatedSequence, index: int) -> Frame:
         return (missing if index % 2 else unreadable)(sequence, index)
 
-    assert observe(20, None, either, range(8, 18), "gaps.max_unread_frames=5").unread == 0
+    assert len(observe(20, either, range(8, 18), "gaps.max_unread_frames=5").drive.unusable) == 10
     with pytest.raises(SequenceError, match=r"image 18\.png is truncated"):
-        observe(20, None, either, range(8, 20), "gaps.max_unread_frames=5")
+        observe(20, either, range(8, 20), "gaps.max_unread_frames=5")
 
 
 def test_a_missing_image_is_an_error_where_gaps_are_switched_off() -> None:
     with pytest.raises(MissingFrameError, match=r"there is no image 8\.png"):
-        observe(20, None, missing, range(8, 10), "gaps.enabled=false")
+        observe(20, missing, range(8, 10), "gaps.enabled=false")
 
 
 def test_too_many_unreadable_images_raise_their_error() -> None:
@@ -263,29 +259,8 @@ def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) ->
             going_on.add(index, frame)
             flushed.add(index, Frame(index, frame.stamp, frame.image))
             flushed.flush()
-            assert len(flushed.state().drive) == flushed.frames == going_on.frames == index + 1
+            assert len(flushed.observations().drive) == flushed.frames == going_on.frames == index + 1
         assert_same(going_on, flushed)
-
-
-@pytest.mark.parametrize("stride", [1, 2])
-def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_path: Path, stride: int) -> None:
-    sequence = Damaged(street(), black, range(12, 14))
-    config = config_with("mapping.enabled=false", f"depth.frame_stride={stride}")
-
-    def begin(state: FrontEndState | None = None) -> Observer:
-        return Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state)
-
-    with begin() as going_on:
-        resumed = begin()
-        for index in range(24):
-            frame = sequence.frame(index)
-            going_on.add(index, frame)
-            with resumed:
-                resumed.add(index, Frame(index, frame.stamp, frame.image))
-                SessionCheckpoint.of(sequence, resumed.state(), "").write(tmp_path / "drive.zip")
-            resumed = begin(SessionCheckpoint.read(tmp_path / "drive.zip").state)
-        with resumed:
-            assert_same(going_on, resumed)
 
 
 def assert_same(one: Observer, other: Observer) -> None:

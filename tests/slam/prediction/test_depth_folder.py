@@ -52,14 +52,6 @@ def test_a_range_of_frames_takes_its_own_files_of_the_whole_sequence(tmp_path: P
     assert metres(opened(folder, FrameNumbers(10, 300, 400)), 0) == pytest.approx(1), "a folder of this range alone"
 
 
-def test_a_continued_run_reads_the_frames_that_follow(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path, [f"{k:06d}.npy" for k in range(10)])
-    whole = opened(folder, FrameNumbers(4, 6, 10, first=6))
-    assert metres(whole, 6) == pytest.approx(7) and metres(whole, 5) == pytest.approx(6)
-    following = opened(folder, FrameNumbers(10, 20, 40, first=20))
-    assert metres(following, 20) == pytest.approx(1) and following.disparity(frame(19)) is None
-
-
 def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path) -> None:
     names = [f"{k:06d}.npy" for k in range(8)]
     folder = folder_of(tmp_path, names)

@@ -42,14 +42,12 @@ class Networks:
 class Source:
     """The scene's disparity times ``gain`` plus ``shift``, known in some frames only."""
 
-    name, sha256, identity = "npy:depth", "9f", "npy"
+    name, sha256 = "npy:depth", "9f"
 
-    def __init__(self, gain: float = 1.0, shift: float = 0.0, unknown: tuple[int, ...] = (), absent: int = 0) -> None:
-        self._gain, self._shift, self._unknown, self._absent = gain, shift, unknown, absent
+    def __init__(self, gain: float = 1.0, shift: float = 0.0, unknown: tuple[int, ...] = ()) -> None:
+        self._gain, self._shift, self._unknown = gain, shift, unknown
 
-    def disparity(self, frame: Frame) -> Disparity | None:
-        if frame.index < self._absent:
-            return None
+    def disparity(self, frame: Frame) -> Disparity:
         disparity = np.asarray(self._gain * SCENE + self._shift, np.float32)
         return np.full_like(disparity, np.nan) if frame.index in self._unknown else disparity
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import slam
-from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.runtime.errors import RunError
@@ -39,61 +38,20 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def test_an_earlier_run_stays_until_the_new_one_replaces_it(make_run: MakeRun) -> None:
+def test_a_new_run_replaces_the_files_of_an_earlier_one_alone(make_run: MakeRun) -> None:
     old = make_run("mine").path
     (old / "notes.txt").write_text("what I saw")
-    before = contents(old)
-    new = begin(old)
-    new.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
-    assert new.path == old / "unfinished" and contents(old) == before
-    new.publish()
-    assert new.path == old and RunFolder.open(old).metrics().tree()["status"] == "running"
-    own = {"metrics.json", "trajectory_optimised.kitti.txt", "trajectory_optimised.tum.txt"}
-    assert {path.name for path in old.iterdir()} == {*own, "notes.txt"}
-    new.publish()
-    assert {path.name for path in old.iterdir()} == {*own, "notes.txt"}
+    assert begin(old).path == old
+    assert {path.name for path in old.iterdir()} == {"metrics.json", "notes.txt"}
 
 
-def test_a_run_without_trajectories_is_replaced_at_once_with_what_was_half_written(tmp_path: Path) -> None:
+def test_what_a_killed_run_was_writing_goes_with_it(tmp_path: Path) -> None:
     begin(tmp_path / "mine")
     (tmp_path / "mine" / ".12.34.partial.map_mesh.ply").write_text("ply")
     (tmp_path / "mine" / ".12.34.partial.thesis.tex").write_text("of somebody else")
     new = RunFolder.create(tmp_path / "mine", tmp_path, "sim")
     assert new.path == tmp_path / "mine"
     assert [path.name for path in new.path.iterdir()] == [".12.34.partial.thesis.tex"]
-
-
-def test_an_unfinished_run_is_removed_with_the_run_beside_it(make_run: MakeRun) -> None:
-    old = make_run("mine").path
-    assert begin(old).path == begin(old).path == old / "unfinished"
-    for path in old.glob("trajectory_*"):
-        path.unlink()
-    assert begin(old).path == old and [path.name for path in old.iterdir()] == ["metrics.json"]
-
-
-@pytest.mark.parametrize("moved", range(4))
-def test_the_next_run_goes_on_where_a_kill_interrupted_the_replacement(
-    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch, moved: int
-) -> None:
-    old = make_run("mine").path
-    new = begin(old)
-    new.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
-    replace, calls = Path.replace, iter(range(moved))
-
-    def killed_later(path: Path, target: Path) -> Path:
-        if next(calls, None) is None:
-            raise KeyboardInterrupt
-        return replace(path, target)
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Path, "replace", killed_later)
-        new.publish()
-    assert RunFolder.open(old).metrics().tree()["status"] in ("ok", "running")
-    again = begin(old)
-    again.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
-    again.publish()
-    own = {"metrics.json", "trajectory_optimised.kitti.txt", "trajectory_optimised.tum.txt"}
-    assert {path.name for path in old.iterdir()} == own
 
 
 def test_runs_that_begin_in_the_same_second_get_a_folder_each(tmp_path: Path) -> None:
@@ -146,15 +104,11 @@ def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplo
     assert RunFolder.open(folder.path).metrics().tree()["status"] == "running"
 
 
-@pytest.mark.parametrize("place", [".", "unfinished"])
-def test_output_with_other_things_is_refused_and_left_alone(make_run: MakeRun, tmp_path: Path, place: str) -> None:
-    output = tmp_path if place == "." else make_run("mine").path
-    (output / place).mkdir(exist_ok=True)
-    (output / place / "thesis.tex").write_text("years of work")
-    before = contents(output)
+def test_output_with_other_things_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(RunError, match="holds no run"):
-        RunFolder.create(output, tmp_path, "sim")
-    assert contents(output) == before and (output / place / "thesis.tex").read_text() == "years of work"
+        RunFolder.create(tmp_path, tmp_path, "sim")
+    assert contents(tmp_path) == {"thesis.tex": b"years of work"}
 
 
 def test_trajectories_survive_a_round_trip(make_run: MakeRun) -> None:
@@ -190,5 +144,3 @@ def test_a_run_opens_by_its_name_and_shows_itself(make_run: MakeRun) -> None:
     (path / "map_mesh.ply").unlink()
     with pytest.raises(RunError, match=r"has no map_mesh\.ply"):
         run.mesh()
-    with pytest.raises(RunError, match=r"has no drive\.zip"):
-        run.keyframes()

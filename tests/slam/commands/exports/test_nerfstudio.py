@@ -107,49 +107,6 @@ def test_interpolated_frames_are_no_images_of_a_colmap_model(make_recorded: Make
     assert [(row[0], row[-1]) for row in images] == [(str(k + 1), f"{k:06d}.png") for k in range(8) if k != 5]
 
 
-@pytest.mark.parametrize(
-    ("rows", "continued_at", "frames", "numbers", "first_shade"),
-    [(11, 3, None, range(3, 11), 0), (7, 3, "2:6", range(3, 7), 20), (8, 3, None, range(8), 0)],
-    ids=["another recording", "a part of one", "the same, killed and resumed"],
-)
-def test_a_continued_run_has_the_images_of_its_last_part(
-    make_recorded: MakeRecorded,
-    tmp_path: Path,
-    rows: int,
-    continued_at: int,
-    frames: str | None,
-    numbers: range,
-    first_shade: int,
-) -> None:
-    folder = make_recorded()
-    lengthen(folder, rows, continued_at, frames)
-    written = export(folder, "nerfstudio", tmp_path / "scene")
-    names = [frame["file_path"] for frame in scene(written)["frames"]]
-    assert names == [f"images/{k:06d}.png" for k in numbers]
-    shades = [int(cv2.imread(str(written / name))[0, 0, 0]) for name in names]
-    assert shades == [first_shade + 10 * k for k in range(len(numbers))]
-
-
-def test_a_last_part_of_another_length_is_refused(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    lengthen(folder, 11, 4)
-    with pytest.raises(RunError, match=r"drive has 8 frames, but .* goes on with 7 at frame 4: give the data set"):
-        export(folder, "nerfstudio", tmp_path / "scene")
-
-
-def lengthen(folder: RunFolder, rows: int, continued_at: int, frames: str | None = None) -> None:
-    """The same run with so many frames at 10 Hz, of which those of this recording begin at one."""
-    from slam.formats.trajectory import Trajectory
-
-    poses = np.tile(np.eye(4), (rows, 1, 1))
-    folder.write_trajectory("optimised", Trajectory(0.1 * np.arange(rows), poses, True))
-    metrics = folder.metrics().tree()
-    metrics["sequence"] |= {"frames": rows, "continued_at": continued_at}
-    if frames is not None:
-        metrics["provenance"]["recording"]["frames"] = frames
-    folder.write_metrics(Metrics.model_validate(metrics))
-
-
 def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path) -> None:
     from slam.formats.trajectory import Trajectory
 

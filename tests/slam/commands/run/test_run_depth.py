@@ -15,13 +15,12 @@ import yaml
 import slam.commands.cli
 from slam import Slam, run_slam
 from slam.commands.localisation.localiser import localise
-from slam.config.sections import load_config
-from slam.loops.places import Places
-from slam.pipeline.checkpoint import read_keyframes
+from slam.config.sections import DepthConfig, load_config
+from slam.prediction.depth_folder import DepthFolder, FrameNumbers
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
-from slam.runtime.run_files import KEYFRAMES, PLACES
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.excerpt import undistortion_of
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
@@ -124,17 +123,20 @@ def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_pat
     depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
     lens: dict[str, Any] = {"width": 416, "height": 128, "fx": 240, "fy": 240, "cx": 207, "cy": 60, "fps": 10}
     camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
-    chosen = [*COARSE_MAP, "output.keep=keyframes"]
-    finished = run(world, tmp_path / "run", f"png:{exact(world)}", *chosen, camera=camera, frames="0:7")
-    pinhole = Places.read(finished.path / PLACES).intrinsics
+    recording = open_sequence(world, "sim", camera)
+    pinhole, lens = recording.intrinsics, undistortion_of(recording)
+    assert lens is not None
     K, coefficients = np.array([[240, 0, 207], [0, 240, 60], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])
     maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), pinhole.K, (416, 128), cv2.CV_32FC1)
     stored = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
     wanted = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
-    kept = next(read_keyframes(finished.path / KEYFRAMES))
-    both = (wanted > 0) & np.isfinite(kept.depth_unscaled)
-    assert np.quantile(np.abs(kept.depth_unscaled / wanted - 1)[both], 0.9) < 0.04  # half a pixel of the road
-    np.testing.assert_array_equal(np.isfinite(kept.depth_unscaled), wanted > 0)
+    source = f"png:{exact(world)}"
+    folder = DepthFolder(DepthConfig(source=source), FrameNumbers(24, 0, 24), 416, 128, lens.apply_to_depth)
+    found = 1 / folder.disparity(recording.frame(0))
+    both = (wanted > 0) & np.isfinite(found)
+    assert np.quantile(np.abs(found / wanted - 1)[both], 0.9) < 0.04  # half a pixel of the road
+    np.testing.assert_array_equal(np.isfinite(found), wanted > 0)
+    assert run(world, tmp_path / "run", source, camera=camera, frames="0:7").metrics().status == "ok"
 
 
 def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path) -> None:
@@ -149,28 +151,6 @@ def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path
     metrics = run(world, tmp_path / "run", f"npy:{folder}", *chosen).metrics().tree()
     assert metrics["trajectories"]["optimised"]["align"]["7dof"]["scale"] == pytest.approx(1.0, abs=0.08)
     assert metrics["scale"]["spread"] < 0.15
-
-
-@pytest.mark.slow
-def test_a_drive_is_continued_with_the_same_source_alone(world: Path, arrays: Path, tmp_path: Path) -> None:
-    first = run(world, tmp_path / "first", f"npy:{arrays}", frames="0:12")
-    whole = run(world, tmp_path / "whole", f"npy:{arrays}")
-    following = {"weights": "sim", "frames": "12:", "continues": first.path}
-    rest = run_slam(world, "sim", output=tmp_path / "rest", **following)
-    np.testing.assert_array_equal(positions(rest), positions(whole))
-    part = tmp_path / "part"
-    part.mkdir()
-    for path in sorted(arrays.glob("*.npy"))[12:]:
-        shutil.copy(path, part)
-    others = {"output": tmp_path / "other", "overrides": [f"depth.source=npy:{part}"]}
-    assert run_slam(world, "sim", **following, **others).metrics().tree()["sequence"]["frames"] == 24
-    for override, message in {
-        "depth.source=network": "other weights or another depth source",
-        f"depth.source=png:{exact(world)}": "other weights or another depth source",
-        "depth.align=scale": "depth cannot be changed",
-    }.items():
-        with pytest.raises(SlamError, match=message):
-            run_slam(world, "sim", **following, overrides=[override], output=tmp_path / "no")
 
 
 def test_live_sessions_take_a_network_and_refuse_folders(

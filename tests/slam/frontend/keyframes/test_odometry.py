@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -7,18 +6,16 @@ import pytest
 import room
 
 from slam.config.sections import KeyframesConfig
-from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose, TrackingEvent
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
-from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
+from slam.frames import KEYFRAME_SOURCE, Intrinsics
+from slam.frontend.keyframes.local_map import LocalMap, TrackIds
+from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
-from slam.runtime.storage.serialisation import Serialiser
 
 CONFIG = KeyframesConfig(max_corners=200)
 
 
-def poses(state: KeyframeOdometryState) -> KeyframePoses:
+def poses(state: KeyframeOdometry) -> KeyframePoses:
     return keyframe_poses(state.segments, room.INTRINSICS)
 
 
@@ -56,7 +53,7 @@ def test_a_map_begins_on_a_plane(seed: int) -> None:
     for k, T_world_camera in enumerate(truth):
         odometry.follow(room.frame(k, T_world_camera, near=False))
         odometry.learn(room.frame(k, T_world_camera, near=False), room.depth_map(T_world_camera))
-    T = chained(poses(odometry.state()))
+    T = chained(poses(odometry))
     estimate = np.stack([T[k] for k in range(50)])
     estimate = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True).apply_to_poses(estimate)
     turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
@@ -98,23 +95,6 @@ def test_another_scene_begins_another_map() -> None:
     assert not any(images[0]) and any(images[1])
 
 
-def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
-    truth = room.walk(40)
-    whole = poses(room.tracked(CONFIG, truth))
-    records = MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent, RelativePose
-    serialiser = Serialiser(KeyframeOdometryState, *records)
-    serialiser.write(tmp_path / "state", room.tracked(CONFIG, truth[:25]))
-    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
-    for k in range(25, 40):
-        frame = room.frame(k, truth[k])
-        odometry.follow(frame)
-        odometry.learn(frame, room.depth_map(truth[k]))
-    resumed = poses(odometry.state())
-    for one, other in zip(whole.poses, resumed.poses, strict=True):
-        np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
-        np.testing.assert_array_equal(one.sigmas, other.sigmas)
-
-
 def test_a_walk_that_begins_with_a_turn_is_one_map() -> None:
     """A turn of 33 degrees, by 3 a frame: no corner of the first image is left in the end."""
     yaw = np.deg2rad(np.arange(-33.0, 0.0, 3.0))
@@ -136,9 +116,8 @@ def test_without_learned_depth_there_is_no_map() -> None:
         view = room.frame(k, T)
         odometry.follow(view)
         odometry.learn(view, np.full((room.INTRINSICS.height, room.INTRINSICS.width), np.nan, np.float32))
-    state = odometry.state()
-    assert poses(state).poses == [] and not state.events
-    assert [segment.started for segment in state.segments] == [False]
+    assert poses(odometry).poses == [] and not odometry.events
+    assert [segment.started for segment in odometry.segments] == [False]
 
 
 def test_a_short_move_has_its_length_by_learned_depth() -> None:
@@ -149,7 +128,7 @@ def test_a_short_move_has_its_length_by_learned_depth() -> None:
         view = room.frame(k, T, near=False)
         odometry.follow(view)
         odometry.learn(view, room.depth_map(T))
-    T = chained(poses(odometry.state()))
+    T = chained(poses(odometry))
     np.testing.assert_allclose(T[4][:3, 3], [0.08, 0.0, 0.0], atol=0.02)
 
 
@@ -164,9 +143,8 @@ def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn() -> None:
             view = replace(view, image=cv2.GaussianBlur(view.image, (0, 0), 5.0))
         odometry.follow(view)
         odometry.learn(view, room.depth_map(T))
-    state = odometry.state()
-    assert [event.event for event in state.events] == ["map begun"]
-    T = chained(poses(state))
+    assert [event.event for event in odometry.events] == ["map begun"]
+    T = chained(poses(odometry))
     assert sorted(T) == list(range(len(truth)))
     turned = rotation_angle(np.stack([T[k][:3, :3].T @ truth[k, :3, :3] for k in range(len(truth))]))
     assert np.rad2deg(turned).max() < 3.0

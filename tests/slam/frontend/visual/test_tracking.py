@@ -74,25 +74,3 @@ def test_lost_corners_are_not_tracked_across(frames):
         UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera
     )
     assert len(CornerTracker(CONFIG).track_across(frames[0], frames[2], nothing)().track_ids) == 0
-
-
-def test_a_tracker_resumes_from_its_state(frames):
-    whole, first = CornerTracker(CONFIG), CornerTracker(CONFIG)
-    for k in range(3):
-        whole.track(frames[k], frames[k + 1])
-        first.track(frames[k], frames[k + 1])
-    state = first.state()
-    second = CornerTracker(CONFIG, state=state)
-    for k in (3, 4):
-        expected, tracks = whole.track(frames[k], frames[k + 1]), second.track(frames[k], frames[k + 1])
-        np.testing.assert_array_equal(tracks.current, expected.current)
-        np.testing.assert_array_equal(tracks.track_ids, expected.track_ids)
-    assert state is first.state() and max(state.corners) == 3  # a state is a value
-
-
-def test_corners_of_old_frames_are_dropped(frames):
-    config = CONFIG.model_copy(update={"steps": (1,), "rotation_baseline_steps": 2})
-    tracker = CornerTracker(config)
-    for k in range(5):
-        tracker.track(frames[k], frames[k + 1])
-    assert sorted(tracker.state().corners) == [2, 3, 4, 5]

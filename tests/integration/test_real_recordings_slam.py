@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from slam.commands.localisation.accuracy import MapTruth
 
 from slam import run_slam
 from slam.commands.localisation.localiser import localise
@@ -45,12 +45,10 @@ def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_p
     run = run_slam(images, frames="0:300", truth=poses, output=tmp_path / "run", device="cpu", overrides=overrides)
     numbers = range(322, 342, 2)  # 0.2 to 0.4 m from the nearest view
     known = read_trajectory(poses).T_world_camera
-    truth = MapTruth.of(run)
-    errors = [
-        truth.error(found, invert(known[0]) @ known[number])
-        for number, found in zip(numbers, localise(images, run, numbers=numbers), strict=True)
-    ]
-    assert sum(error is not None and error.error_m < 0.1 for error in errors) >= 9
+    T_world_image = invert(known[0]) @ known[numbers.start : numbers.stop : numbers.step]
+    found = [each.T_world_camera for each in localise(images, run, numbers=numbers)]
+    errors_m = [np.inf if T is None else np.linalg.norm((T - true)[:3, 3]) for T, true in zip(found, T_world_image)]
+    assert sum(error_m < 0.15 for error_m in errors_m) >= 9
     street = data_root / "street_depth" / "images"
     assert all(found.T_world_camera is None for found in localise(street, run, Path("fov=70")))
 

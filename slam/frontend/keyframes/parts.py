@@ -45,7 +45,8 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     shared = np.array([len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in pairwise(keyframes)])
     tied = shared >= MIN_POINTS
     sigmas = _sigmas(segment.map, intrinsics)
-    segment = _held(segment, np.where(tied, _DRIFT * np.minimum(sigmas, _TURNED), _UNKNOWN))
+    along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
+    segment = _held(segment, np.where(tied, along, _UNKNOWN))
     local, keyframes = segment.map, segment.map.keyframes
     number = np.concatenate([[0], np.cumsum(~(_carries(sigmas) & tied))])
     pace = _pace([pair for pair, is_tied in zip(pairwise(keyframes), tied, strict=True) if is_tied])

@@ -51,7 +51,7 @@ def test_a_hole_of_the_road_is_closed_and_marked(street_map):
     filled = mesh.vertices["filled"] > 0
     assert filled.sum() == 1
     np.testing.assert_allclose(mesh.points[filled][0], [0, 1.65, 20], atol=0.7)
-    assert mesh.normals[filled][0][1] < -0.99
+    assert mesh.vertices["ny"][filled][0] < -0.99
     assert len(whole.cloud().points) == len(mesh.points) - 1
     assert not street_map(hidden=True, close_holes_m=1.5, min_weight=2.0).mesh().vertices["filled"].any()
 

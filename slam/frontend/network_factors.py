@@ -38,7 +38,7 @@ class NetworkCalibration:
     Attributes:
         unit: ``(N,)``, length per unscaled length of the step.
         sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length of a step.
-        pairs: steps by which they were measured; 0 where these were too few.
+        pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that of learned depth.
     """
 
     unit: FloatArray
@@ -47,7 +47,7 @@ class NetworkCalibration:
 
     def over(self, depth_unit: FloatArray) -> str:
         """The unit over that of learned depth ``(N,)`` and the noise, for logs."""
-        if not self.pairs:
+        if self.pairs < LEAST_PAIRS:
             return f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
         least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
         rotation, translation = np.rad2deg(np.median(self.sigmas[:, :3])), np.median(self.sigmas[:, 5])
@@ -89,7 +89,7 @@ def calibrate_network(
     """
     pairs = [p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR and steps.keys() >= _between(p)]
     if len(pairs) < LEAST_PAIRS:
-        return _by_depth(depth_unit)
+        return _by_depth(depth_unit, len(pairs))
     first, last = np.array([p.ends for p in pairs]).T
     T_network = np.array([reduce(np.matmul, (steps[k] for k in range(*p.ends))) for p in pairs])
     T_geometric = np.array([p.T_from_to for p in pairs])
@@ -99,7 +99,7 @@ def calibrate_network(
     ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
     used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
     if used.sum() < LEAST_PAIRS:
-        return _by_depth(depth_unit)
+        return _by_depth(depth_unit, int(used.sum()))
     unit = 1.0 / _nearest_median(first[used], ratio[used], len(depth_unit))
     t_network *= unit[first, None]
     reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
@@ -120,7 +120,7 @@ def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibra
     # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
     usual = running_median(lengths, _NEAREST_PAIRS + 1)
     reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
-    # a unit that is unknown is so for all steps alike, and wide enough by itself
+    # with nothing beside them, the usual sigmas are wide enough by themselves
     widening = np.sqrt(_CORRELATED_STEPS) if calibration.pairs else 1.0
     factors = []
     for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
@@ -160,8 +160,8 @@ def _between(pose: RelativePose) -> set[int]:
     return set(range(pose.from_index, pose.to_index))
 
 
-def _by_depth(depth_unit: FloatArray) -> NetworkCalibration:
-    return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), 0)
+def _by_depth(depth_unit: FloatArray, pairs: int) -> NetworkCalibration:
+    return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), pairs)
 
 
 def _nearest_median(frames: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:

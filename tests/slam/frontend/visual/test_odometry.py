@@ -328,7 +328,7 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(texture, turn_d
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "first", "last", "block", "largest_deg"),
-    [("00", 90, 121, False, 0.5), ("05", 90, 121, False, 0.5), ("00", 100, 170, True, 1.0)],
+    [("00", 90, 121, False, 0.5), ("05", 90, 121, False, 0.5), ("00", 100, 170, True, 1.5)],
 )
 def test_rotation_on_real_frames(data_root, name, first, last, block, largest_deg):
     folder = data_root / "kitti_odometry" / "sequences" / name

@@ -54,6 +54,7 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/house.py
 
 # MkDocs stays out of .venv; it reads the code there
 $(DOCS)/.ready: requirements-docs.lock $(READY)

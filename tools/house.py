@@ -1,4 +1,7 @@
-"""Compare the size of the tree with its budget, ``[tool.house]`` of pyproject.toml; exit code 1 where it is larger."""
+"""Compare the size of the tree with its budget, ``[tool.house]`` of pyproject.toml; exit code 1 where it is larger.
+
+Example: python tools/house.py
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ import re
 import sys
 import tomllib
 from pathlib import Path
+
+from shared.command import parser_of
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,6 +29,7 @@ def sizes() -> dict[str, int]:
 
 
 if __name__ == "__main__":
+    parser_of(__doc__).parse_args()
     budget = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["house"]
     over = [f"{name} {size}, budget {budget[name]}" for name, size in sizes().items() if size > budget[name]]
     if over:

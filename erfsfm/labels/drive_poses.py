@@ -22,7 +22,7 @@ from erfsfm.common.readers.pinhole import Pinhole
 FPS = 10.0
 CAMERA_HEIGHT_M = 1.65  # any: poses are given in camera heights
 TRAJECTORY = "trajectory_optimised.kitti.txt"
-SETTINGS = ("mapping.enabled=false", "output.keep=nothing", "output.report=false")
+SETTINGS = ("mapping.enabled=false", "output.report=false")
 
 
 def drive_poses(

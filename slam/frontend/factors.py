@@ -44,6 +44,9 @@ def make_factors(drive: Drive, scale: Scale, visual_odometry: VisualOdometryConf
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
     logger.info("pose network: %s", calibration.over(scale.per_frame))
     networks = network_factors(steps, calibration)
+    if not calibration.is_measured:  # lengths in the wrong unit have no say beside measured ones
+        by_geometry = {pose.ends for pose in geometric}
+        networks = [factor for factor in networks if factor.ends not in by_geometry]
     interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
     by_network, interpolated, by_image = (
         [pose for pose in poses if not maps.is_inside(pose)] for poses in (networks, interpolated, geometric)

@@ -45,9 +45,14 @@ class NetworkCalibration:
     sigmas: FloatArray
     pairs: int
 
+    @property
+    def is_measured(self) -> bool:
+        """Whether enough steps measured the unit and the noise."""
+        return self.pairs >= LEAST_PAIRS
+
     def over(self, depth_unit: FloatArray) -> str:
         """The unit over that of learned depth ``(N,)`` and the noise, for logs."""
-        if self.pairs < LEAST_PAIRS:
+        if not self.is_measured:
             return f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
         least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
         rotation, translation = np.rad2deg(np.median(self.sigmas[:, :3])), np.median(self.sigmas[:, 5])
@@ -121,7 +126,7 @@ def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibra
     usual = running_median(lengths, _NEAREST_PAIRS + 1)
     reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
     # with nothing beside them, the usual sigmas are wide enough by themselves
-    widening = np.sqrt(_CORRELATED_STEPS) if calibration.pairs else 1.0
+    widening = np.sqrt(_CORRELATED_STEPS) if calibration.is_measured else 1.0
     factors = []
     for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
         sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)

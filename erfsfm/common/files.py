@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import select
-import stat
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -65,21 +63,6 @@ def read_bytes(path: Path, most: int) -> bytes:
     if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
         return content
     raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
-
-
-def open_written(path: str, wait_s: float) -> int:
-    """A file descriptor for reading; of a pipe, once something was written to it.
-
-    Raises:
-        OSError: it cannot be opened, or is a pipe that nothing was written to for ``wait_s``.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    is_pipe = stat.S_ISFIFO(os.fstat(descriptor).st_mode)
-    if is_pipe and not select.select([descriptor], [], [], wait_s)[0]:
-        os.close(descriptor)
-        raise OSError(errno.ETIMEDOUT, f"a pipe that nothing was written to for {wait_s:g} s", path)
-    os.set_blocking(descriptor, True)
-    return descriptor
 
 
 def read_text(path: Path, encoding: str = "utf-8-sig", most: int = MAX_TEXT_BYTES) -> str:

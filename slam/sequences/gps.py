@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from erfsfm.common.files import read_text
+from slam.formats.rows import BadRows
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -42,22 +43,26 @@ def read_gps(path: Path) -> GpsTrack:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     lines = text.splitlines()
     try:
-        rows = _nmea_rows(lines, path) if text.lstrip().startswith("$") else _csv_rows(lines, path)
+        found = _nmea_rows(lines) if text.lstrip().startswith("$") else _csv_rows(lines, path)
     except csv.Error as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
-    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    if not len(table):
+    bad = BadRows(path, SequenceError)
+    good = [(row, fix) for row, fix in found if _is_fix(fix)]
+    for row, fix in found:
+        if not _is_fix(fix):
+            bad.add(row, "no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed")
+    table = np.array([fix for _, fix in good], dtype=np.float64).reshape(-1, 5)
+    if not found:
         wrong = sum("*" in line and _sentence(line) == [""] for line in lines)
         raise SequenceError(
             f"{path} holds no GPS fix with an altitude: CSV with a header {','.join(_COLUMNS)}, or NMEA is read"
             + (f"; {wrong} sentences have a wrong checksum" if wrong else "")
         )
-    stamps = table[:, 0]
-    if (np.diff(stamps) <= 0).any():
-        row = int(np.argmax(np.diff(stamps) <= 0)) + 2
-        raise SequenceError(f"{path}: the stamp of fix {row} does not follow that of the one before: sort the file")
+    ordered = bad.in_order(table[:, 0], "stamps", np.array([row for row, _ in good], np.intp))
+    bad.say(int(ordered.sum()), "GPS fixes")
+    table = table[ordered]
     _require_possible_speed(table, path)
-    return GpsTrack(stamps, table[:, 1:4], table[:, 4])
+    return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4])
 
 
 def _require_possible_speed(table: FloatArray, path: Path) -> None:
@@ -74,8 +79,8 @@ def _require_possible_speed(table: FloatArray, path: Path) -> None:
         )
 
 
-def _csv_rows(lines: list[str], path: Path) -> list[list[float]]:
-    """Rows of stamp, latitude, longitude, altitude, dilution."""
+def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
+    """Lines with stamp, latitude, longitude, altitude, dilution; nothing where a row is none."""
     delimiter = max(",;\t", key=lines[0].count) if lines else ","
     reader = csv.DictReader(lines, skipinitialspace=True, delimiter=delimiter)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
@@ -87,28 +92,30 @@ def _csv_rows(lines: list[str], path: Path) -> list[list[float]]:
             numbers = [float(row[name]) for name in _COLUMNS] + [float(row.get("hdop") or 1.0)]
         except (TypeError, ValueError):
             numbers = []
-        rows.append(_checked(numbers, f"{path} row {reader.line_num}"))
+        rows.append((reader.line_num, numbers))
     return rows
 
 
-def _nmea_rows(lines: Iterable[str], path: Path) -> list[list[float]]:
+def _nmea_rows(lines: Iterable[str]) -> list[tuple[int, list[float]]]:
     """The same of GGA sentences with a fix and its altitude; each receiver repeats a fix at most once a stamp."""
-    rows: list[list[float]] = []
+    rows: list[tuple[int, list[float]]] = []
+    before = -np.inf
     for number, line in enumerate(lines, start=1):
         words = _sentence(line)
         if words[0][-3:] != "GGA" or len(words) < 10 or words[6] in ("", "0") or not words[9]:
             continue
         try:
             stamp = _seconds(words[1])
-            if rows and stamp < rows[-1][0] - _DAY_S / 2:
+            if stamp < before - _DAY_S / 2:
                 stamp += _DAY_S
             fix = [stamp, _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])]
             fix.append(float(words[8] or 1.0))
         except ValueError:
             fix = []
-        if fix and rows and fix[0] == rows[-1][0]:
+        if fix and fix[0] == before:
             continue
-        rows.append(_checked(fix, f"{path} row {number}"))
+        before = fix[0] if fix else before
+        rows.append((number, fix))
     return rows
 
 
@@ -131,8 +138,6 @@ def _degrees(word: str, side: str) -> float:
     return -degrees if side in ("S", "W") else degrees
 
 
-def _checked(numbers: list[float], where: str) -> list[float]:
+def _is_fix(numbers: list[float]) -> bool:
     place: FloatArray = np.array(numbers[1:4])
-    if len(numbers) != 5 or not np.isfinite(numbers).all() or (abs(place) > _MOST).any() or numbers[4] <= 0:
-        raise SequenceError(f"{where} is no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed")
-    return numbers
+    return len(numbers) == 5 and bool(np.isfinite(numbers).all() and (abs(place) <= _MOST).all() and numbers[4] > 0)

@@ -55,11 +55,11 @@ def test_a_wrong_checksum_is_left_out(tmp_path: Path) -> None:
     [
         ("time,lat\n1,2\n", "lacks stamp, latitude, longitude, altitude"),
         ("stamp,latitude,longitude,altitude\n", "holds no GPS fix"),
-        ("stamp,latitude,longitude,altitude\n0,95,8,100\n", "row 2 is no GPS fix"),
-        ("stamp,latitude,longitude,altitude\n0,x,8,100\n", "row 2 is no GPS fix"),
-        ("stamp,latitude,longitude,altitude\n1,49,8,100\n1,49,8,100\n", "fix 2 does not follow"),
+        ("stamp,latitude,longitude,altitude\n0,95,8,100\n", "line 2: no GPS fix"),
+        ("stamp,latitude,longitude,altitude\n0,x,8,100\n", "line 2: no GPS fix"),
+        ("stamp,latitude,longitude,altitude\n1,49,8,100\n1,49,8,100\n", "stamps must increase"),
         ("stamp,latitude,longitude,altitude\n1,49,8,100\n2,50,8,100\n3,51,8,100\n", "fixes move at 11119[45] m/s"),
-        ("$GPGGA,123519,48x07.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,", "row 1 is no GPS fix"),
+        ("$GPGGA,123519,48x07.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,", "line 1: no GPS fix"),
     ],
 )
 def test_what_is_no_track(tmp_path: Path, text: str, said: str) -> None:
@@ -70,3 +70,11 @@ def test_what_is_no_track(tmp_path: Path, text: str, said: str) -> None:
 def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match=r"cannot be read as a GPS track: No such file or directory; give"):
         read_gps(tmp_path / "none.csv")
+
+
+def test_bad_fixes_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = [f"{k},49.000{k},8,100" for k in range(8)]
+    rows[3], rows[5] = "3,nan,8,100", "4,49.0004,8,100"
+    (tmp_path / "track").write_text("\n".join(["stamp,latitude,longitude,altitude", *rows, "9,,,"]))
+    assert read_gps(tmp_path / "track").stamps.tolist() == [0, 1, 2, 4, 6, 7]
+    assert "3 of 9 rows" in caplog.text and "line 5" in caplog.text

@@ -60,6 +60,13 @@ class BadRows:
             raise self._error(f"{self._path}, line {line}: {what} must increase; sort the rows, a series a file")
         return good
 
+    def ordered(self, rows: Sequence[tuple[int, float, Path]], wanted: str) -> tuple[NDArray[np.float64], list[Path]]:
+        """Stamps and files of an index, of its lines with both in the order of time; says which are left out."""
+        stamps = np.array([stamp for _, stamp, _ in rows])
+        good = self.in_order(stamps, "stamps", np.array([line for line, _, _ in rows], np.intp))
+        self.say(int(good.sum()), wanted)
+        return stamps[good], [rows[k][2] for k in np.flatnonzero(good)]
+
     def say(self, left: int, wanted: str) -> None:
         """Warn of the rows left out.
 
@@ -99,9 +106,14 @@ def increasing(values: Sequence[float]) -> NDArray[np.bool_]:
     return chosen
 
 
-def number_or_nan(word: str) -> float:
-    """Python's reading of a number, without its underscores; NaN where it is none."""
+def is_number(word: str) -> bool:
+    """Whether Python reads a number, without its underscores."""
     try:
-        return float(word) if "_" not in word else math.nan
+        return "_" not in word and float(word) is not None
     except ValueError:
-        return math.nan
+        return False
+
+
+def number_or_nan(word: str) -> float:
+    """A number; NaN where the word is none."""
+    return float(word) if is_number(word) else math.nan

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
-from slam.formats.rows import BadRows
+from slam.formats.rows import BadRows, is_number
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
@@ -284,7 +284,7 @@ def _read_numbers(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Line and row numbers ``(N,)`` of a file, and its table ``(N, columns)`` of the commonest of these forms."""
     table = list(_read_words(path))
-    if table and not any(_is_number(word) for word in table[0][1]):
+    if table and not any(is_number(word) for word in table[0][1]):
         del table[0]  # a header
     counts = Counter(len(words) for _, words in table)
     columns = max(forms, key=lambda form: counts[form])
@@ -309,17 +309,10 @@ def _number(word: str) -> float:
     Raises:
         ValueError: it is none.
     """
-    if not _is_number(word):
-        hint = "; decimals are written with a point" if _is_number(word.replace(",", ".")) else ""
+    if not is_number(word):
+        hint = "; decimals are written with a point" if is_number(word.replace(",", ".")) else ""
         raise ValueError(f"not a number: {word!r}{hint}")
     return float(word)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return "_" not in word and float(word) is not None
-    except ValueError:
-        return False
 
 
 def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:

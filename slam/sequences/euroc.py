@@ -163,10 +163,7 @@ def _read_index(table: Path) -> tuple[FloatArray, list[Path]]:
             rows.append((number, int(words[0]) / _NANOSECONDS, table.parent / "data" / words[-1]))
         elif line.strip() and not line.startswith("#"):
             bad.add(number, f"{line!r} is not 'nanoseconds,file'")
-    stamps = np.array([stamp for _, stamp, _ in rows])
-    good = bad.in_order(stamps, "stamps", np.array([number for number, _, _ in rows], np.intp))
-    bad.say(int(good.sum()), "a row of nanoseconds and file for each image")
-    return stamps[good], [rows[k][2] for k in np.flatnonzero(good)]
+    return bad.ordered(rows, "a row of nanoseconds and file for each image")
 
 
 def _camera_folder(body: Path) -> Path | None:

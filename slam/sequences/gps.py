@@ -47,9 +47,11 @@ def read_gps(path: Path) -> GpsTrack:
     except csv.Error as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     bad = BadRows(path, SequenceError)
-    good = [(row, fix) for row, fix in found if _is_fix(fix)]
+    good = []
     for row, fix in found:
-        if not _is_fix(fix):
+        if _is_fix(fix):
+            good.append((row, fix))
+        else:
             bad.add(row, "no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed")
     table = np.array([fix for _, fix in good], dtype=np.float64).reshape(-1, 5)
     if not found:

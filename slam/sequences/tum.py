@@ -93,10 +93,7 @@ def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
             bad.add(line, f"{text!r} is not 'stamp file'")
     if path.name == _DEPTH_INDEX:
         rows.sort(key=lambda row: row[1])  # it is looked up by time alone
-    stamps = np.array([stamp for _, stamp, _ in rows])
-    good = bad.in_order(stamps, "stamps", np.array([line for line, _, _ in rows], np.intp))
-    bad.say(int(good.sum()), "rows of 'stamp file'")
-    return stamps[good], [rows[k][2] for k in np.flatnonzero(good)]
+    return bad.ordered(rows, "rows of 'stamp file'")
 
 
 def _text(path: Path) -> str:

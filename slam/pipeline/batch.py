@@ -224,7 +224,7 @@ class SlamPipeline:
     def _chained(self, odometry: Odometry) -> Odometry:
         """The same with the factors of its drive, chained, in the unit of the mode: of closed maps it is found anew."""
         config, drive, scale, agreements = self._config, odometry.drive, odometry.scale, odometry.agreements
-        factors = make_factors(drive, scale, config.visual_odometry)
+        factors = make_factors(drive, scale)
         T_odometry = chain_odometry(factors, len(drive))
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(T_odometry)

@@ -19,7 +19,7 @@ from slam import Slam
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.geometry.se3 import apply, is_se3
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.run import SlamPipeline
 from slam.runtime.errors import SlamError
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
@@ -65,7 +65,7 @@ def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_r
     feed(slam, FRAMES - 9, FRAMES)
     apart = np.abs(slam.trajectory().T_world_camera[: FRAMES - 9] - before).max(axis=(1, 2))
     assert apart[: FRAMES - 99].max() == 0.0 < apart[FRAMES - 99 :].max()
-    batch = SlamPipeline(drive(), oracle(), config).estimate()
+    batch = SlamPipeline(drive(), oracle(), config).run()
     loops = slam.close_loops()
     assert len(loops.accepted) >= 5
     assert [loop.ends for loop in loops.accepted] == [loop.ends for loop in batch.loops.accepted]

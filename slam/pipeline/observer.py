@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from erfsfm.common.errors import COUNTED
+from erfsfm.common.errors import COUNTED, OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
 from slam.frontend.drive import Drive, Keyframe
@@ -123,6 +123,7 @@ class Observer:
         self._snippet_frames: tuple[Frame, ...] = ()
         self._recent: tuple[FrameInWork, ...] = ()
         self._unread = 0  # frames in a row whose image cannot be read
+        self._failed = 0  # and whose measurement failed
         self._depth_index = -1  # the last frame whose depth was asked for
         self._spill_file = SpillFile()
         self._networks = predictor.executor()
@@ -173,7 +174,7 @@ class Observer:
         """Finish every frame so far."""
         self._measure_pending()
         while self._tasks:
-            self._finish_tasks()
+            self._measure(len(self.drive) - 1, self._finish_tasks)
 
     def observations(self) -> Observations:
         """All measurements so far; more frames may follow."""
@@ -196,8 +197,12 @@ class Observer:
         if isinstance(error, MissingFrameError) and self._config.gaps.enabled:
             return
         self._unread += 1
-        if not self._config.gaps.enabled or self._unread > self._config.gaps.max_unread_frames:
+        if not self._is_gap(self._unread):
             raise error
+
+    def _is_gap(self, frames: int) -> bool:
+        """Whether so many frames in a row may be without a measurement."""
+        return self._config.gaps.enabled and frames <= self._config.gaps.max_unread_frames
 
     def _leave_out(self, index: int, reason: str) -> None:
         try:
@@ -250,18 +255,31 @@ class Observer:
         pending, self._pending = self._pending, None
         if pending is None:
             return
+        self._measure(pending.frame.index, partial(self._stages, pending))
+
+    def _measure(self, index: int, compute: Callable[[], None]) -> None:
+        """Compute what is measured of a frame, which is a gap after an error that nobody foresaw.
+
+        Known errors are for the user to mend; too many in a row are not of single frames.
+        """
         try:
-            self._measure(pending)
+            compute()
         except Exception as error:
-            # callers may continue after this: the frame becomes a gap, with one entry in ``roads`` as all frames
             self._tasks.clear()
             self._recent = ()
-            self.drive.unusable[pending.frame.index] = f"it could not be measured ({error})"
-            if len(self.drive) == pending.frame.index:
-                self.drive.roads.append(MeasurementFailure(str(error)))
-            raise
+            reason = f"it could not be measured: {explained(error)}"
+            self.drive.unusable[index] = reason
+            if len(self.drive) == index:  # one entry in ``roads`` as all frames
+                self.drive.roads.append(MeasurementFailure(reason))
+            self._failed += 1
+            is_known = isinstance(error, OneLineError | OSError | MemoryError)
+            if is_known or shows_traceback() or not self._is_gap(self._failed):
+                raise
+            logger.warning("frame %d is a gap: %s", index, reason)
+        else:
+            self._failed = 0
 
-    def _measure(self, current: FrameInWork) -> None:
+    def _stages(self, current: FrameInWork) -> None:
         """The stages of a frame; the tasks that they leave to other threads end with the next frame."""
         self._current, was_asked = current, current.prediction is not None
         previous, drive = self._recent[-1] if self._recent else None, self.drive

@@ -1,4 +1,4 @@
-"""Frames of a source in a thread of their own, and a drive that grows as they arrive, as a sequence for the pipeline."""
+"""Frames of a source in a thread of their own, and the drive that grows as they arrive, as a sequence."""
 
 from __future__ import annotations
 

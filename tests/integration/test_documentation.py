@@ -270,8 +270,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 shutil.copytree("world/sequences/sim", f"{name}/sequences/{sequence}")
                 Path(name, "poses").mkdir(exist_ok=True)
                 shutil.copy("world/poses/sim.txt", f"{name}/poses/{sequence}.txt")
-        for name in ("worlds/600", "WORLD_600"):
-            shutil.copytree("world", name)
+        shutil.copytree("world", "worlds/600")
         raw_drive(Path("KITTI_RAW"), Path("scanned/sequences/sim"))
         Path("my_frames.txt").write_text("2011_09_26_drive_0013 5\n")
         call(f"erfsfm-slam run --dataset KITTI --sequence 09 --frames 0:{FIRST_RUN}")

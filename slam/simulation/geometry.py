@@ -213,19 +213,21 @@ class Bend:
 FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))  # the plan as it is
 
 
-def town_bend(rng: np.random.Generator) -> Bend:
-    """Streets that sway by a few degrees over gentle hills."""
+def town_bend(rng: np.random.Generator, hills: tuple[float, float] | None = None) -> Bend:
+    """Streets that sway by a few degrees over gentle hills, or over some of a steepness and a wavelength in metres."""
     wavelengths = rng.uniform([120.0, 120.0, 140.0], [220.0, 220.0, 220.0])
-    return Bend(
-        amplitudes=np.array([*rng.uniform(0.5, 2.2, 2), rng.uniform(0.1, 0.45)]),
-        wavelengths=wavelengths,
-        phases=rng.uniform(0.0, 2.0 * np.pi, (3, 2)),
-    )
+    amplitudes = np.array([*rng.uniform(0.5, 2.2, 2), rng.uniform(0.1, 0.45)])
+    phases = rng.uniform(0.0, 2.0 * np.pi, (3, 2))
+    if hills is not None:
+        wavelengths[2] = hills[1]
+        amplitudes[2] = hills[0] * hills[1] / (2.0 * np.pi)
+        phases[2, 1] = rng.uniform(-0.35, 0.35)  # across the road at y = 0 it is at most a third as steep as along it
+    return Bend(amplitudes, wavelengths, phases)
 
 
-def road_bend(rng: np.random.Generator, start: float, end: float) -> Bend:
+def road_bend(rng: np.random.Generator, start: float, end: float, hills: tuple[float, float] | None = None) -> Bend:
     """A road whose heading wanders within about 35 degrees, radius of curvature at least about 80 m."""
-    town = town_bend(rng)
+    town = town_bend(rng, hills)
     s = np.arange(np.floor(start), np.ceil(end) + 2.0)
     heading = np.zeros_like(s)
     for wavelength, amplitude in ((rng.uniform(330.0, 480.0), 0.38), (rng.uniform(150.0, 220.0), 0.14)):

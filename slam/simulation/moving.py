@@ -15,13 +15,13 @@ class Moving:
         self._mesh = soup.finish(FLAT)
         self._thing_of_triangle = np.searchsorted(first_instances, self._mesh.instance, side="right") - 1
 
-    def placed(self, T_scene_things: dict[int, FloatArray]) -> Mesh | None:
-        """The things of these numbers at their poses ``(4, 4)``; None where there are none."""
+    def placed(self, T_scene_things: dict[int, FloatArray]) -> list[Mesh]:
+        """One mesh of the things of these numbers at their poses ``(4, 4)``; none of no things."""
         if not T_scene_things:
-            return None
+            return []
         parts = [self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()]
         corners = np.concatenate([part.vertices for part in parts])
-        return dataclasses.replace(
+        placed = dataclasses.replace(
             self._mesh,
             vertices=corners,
             triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
@@ -31,6 +31,7 @@ class Moving:
             instance=np.concatenate([part.instance for part in parts]),
             material=np.concatenate([part.material for part in parts]),
         )
+        return [placed]
 
     def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:
         """The triangles of one thing, three vertices each, moved into the scene."""

@@ -1,7 +1,5 @@
 """The simulated camera: intrinsics, rays and the size of a pixel on a surface."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from slam.simulation.geometry import Float32Array, FloatArray
@@ -23,28 +21,6 @@ def square_intrinsics(width: int, height: int, fov_deg: float) -> FloatArray:
     """Camera matrix ``(3, 3)`` of square pixels with a horizontal field of view, its centre in the middle."""
     focal_px = 0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg))
     return np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class Mount:
-    """A camera that differs from KITTI's.
-
-    Attributes:
-        zoom: factor on the focal length.
-        height_m: above the road at rest.
-        pitch: downwards, radians.
-    """
-
-    zoom: float
-    height_m: float
-    pitch: float
-
-
-def draw_mount(seed: int) -> Mount:
-    """The camera of a varied world."""
-    rng = np.random.default_rng([seed, 5])
-    zoom, height_m = np.exp(rng.uniform(np.log((0.75, 1.1)), np.log((1.4, 2.4))))
-    return Mount(float(zoom), float(height_m), float(np.deg2rad(rng.uniform(-3.0, 3.0))))
 
 
 def pixel_rays(K: FloatArray, width: int, height: int) -> Float32Array:

@@ -50,6 +50,9 @@ def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px:
         focal_px: focal length in pixels.
     """
     rgb = unlit(mesh, hits, focal_px)
+    if weather.contrast != 1.0:
+        base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
+        rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
     rgb *= light(weather, hits.normals, lit)
     haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
     return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)

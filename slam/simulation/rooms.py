@@ -89,9 +89,9 @@ class SimulatedRooms(SimulatedWorld):
         poses = self._carried.poses(np.maximum(moments, 0.0)).reshape(*offsets.shape, 4, 4)
         return poses[:, 0] if offsets.shape[1] == 1 else poses
 
-    def _moving(self, index: int) -> Mesh | None:
+    def _moving(self, index: int) -> list[Mesh]:
         if self._people is None:
-            return None
+            return []
         now = index / self.options.rate
         T_scene_people = [_standing(self._carried, now + _AHEAD_S), *(_standing(walk, now) for walk in self._walks)]
         camera = self._T_scene_camera[index, :2, 3]

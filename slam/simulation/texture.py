@@ -31,9 +31,15 @@ def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) ->
     rgb = _junction(texels, colours, parameters)
     half, dash, fraction = parameters[0, 0], parameters[1, 0], parameters[2, 0]
     lengthways = stripes(texels.u, texels.u_size, float(2.0 * dash), float(2.0 * dash * fraction))
-    paint = lengthways * band(texels.v, texels.v_size, -0.07, 0.07)
+    lane = float(parameters[4, 0])
+    if lane > 0.0:
+        inside = np.abs(texels.v) < half - 3.0
+        paint = lengthways * inside * stripes(texels.v + 0.07, texels.v_size, lane, 0.14)
+    else:
+        paint = lengthways * band(texels.v, texels.v_size, -0.07, 0.07)
     if parameters[3, 0] > 0.5:
-        paint += band(np.abs(texels.v), texels.v_size, half - 2.15, half - 2.03)
+        low, high = (2.15, 2.03) if half > 4.5 else (0.35, 0.23)  # beside parked cars, or beside the verge
+        paint += band(np.abs(texels.v), texels.v_size, half - low, half - high)
     painted = np.flatnonzero(paint > 0.01)
     wear = np.clip(0.78 + fractal(_take(texels, painted), (0.9, 0.2, 0.5), (0.3, 0.1, 0.3)), 0.15, 1.0)
     rgb[:, painted] = mix(rgb[:, painted], colours[1][:, painted], paint[painted] * wear)
@@ -45,7 +51,8 @@ def _junction(texels: Texels, colours: Float32Array, parameters: Float32Array) -
     repair = fractal(texels, (5.0, 2.4, 1.0))  # repaired patches have sharp edges
     patch = np.clip((repair - 0.42) * 6.0, 0.0, 1.0) * 0.26
     crack = 0.3 * np.clip(1.0 - 14.0 * np.abs(fractal(texels, (2.6, 1.3, 1.0)) + 0.4 * grain - 0.05), 0.0, 1.0)
-    return np.asarray(colours[0] * (1.0 + grain - patch - crack))
+    rough = 1.0 - parameters[5, 0]
+    return np.asarray(colours[0] * (1.0 + rough * grain - rough * patch - rough * crack))
 
 
 def _pavement(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:

@@ -100,7 +100,7 @@ def simulate(
     varied: Annotated[
         bool,
         typer.Option(
-            "--varied", help="another camera than KITTI's, railings, people, cars that overtake; of rooms another lens"
+            "--varied", help="any camera, hills, hard light, kinds of street, people, overtaking; of rooms another lens"
         ),
     ] = False,
     motion: Annotated[

@@ -84,7 +84,7 @@ class SimulatedStreet(SimulatedWorld):
 
     @functools.cached_property
     def _bonnet(self) -> Moving | None:
-        """The bonnet of the own car, in the camera's frame; none in images of moving exposures, which do not move it."""
+        """The bonnet of the own car; none under motion blur, which would smear it against the camera."""
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
         rng = np.random.default_rng([self.options.seed, 12])

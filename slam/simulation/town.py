@@ -250,7 +250,7 @@ class _Town:
             self._edge(frame, length)
 
     def _edge(self, frame: FloatArray, length: float) -> None:
-        """What separates a road from the open land beside it: barriers of motorways; fences, hedges or rows of trees."""
+        """What stands between a road and the open land beside it."""
         rng, soup, kind = self.rng, self.soup, self.rng.random()
         if self.plan.kind == "motorway":
             if kind < 0.75:

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Soup
-from slam.simulation.moving import Moving
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving, Soup
 from slam.simulation.objects import car, frame_at
 from slam.simulation.route import STEP, Route
 

@@ -1,11 +1,12 @@
-"""Sun, sky and haze of one world."""
+"""Sun, sky and haze of one street, and what they make of its colours."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from slam.simulation.geometry import Float32Array
-from slam.simulation.noise import Texels, fractal
+from slam.simulation.geometry import Float32Array, Mesh
+from slam.simulation.surface import Hits, unlit
+from slam.simulation.texture import Texels, fractal
 
 
 @dataclass(frozen=True)
@@ -105,3 +106,22 @@ def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32
     warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
     cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
     return np.asarray(direct * warm + around * cool, dtype=np.float32)
+
+
+def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px: float) -> Float32Array:
+    """Colour of each hit in the open, ``(3, N)``.
+
+    Args:
+        mesh: what was hit.
+        hits: where, sorted by material.
+        lit: 1 where the sun is seen, ``(N,)``.
+        weather: of the world.
+        focal_px: focal length in pixels.
+    """
+    rgb = unlit(mesh, hits, focal_px)
+    if weather.contrast != 1.0:
+        base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
+        rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
+    rgb *= light(weather, hits.normals, lit)
+    haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+    return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)

@@ -12,17 +12,14 @@ from numpy.typing import NDArray
 
 from slam.runtime.imports import import_open3d
 from slam.simulation import hazards as effects
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Soup
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving, Soup
 from slam.simulation.hazards import Traffic
-from slam.simulation.lidar import T_CAMERA_LIDAR, beam_directions, measured
-from slam.simulation.light import draw_varied_weather, draw_weather, sky
-from slam.simulation.moving import Moving
+from slam.simulation.light import draw_varied_weather, draw_weather, paint, sky
 from slam.simulation.objects import bonnet
-from slam.simulation.optics import kitti_intrinsics, square_intrinsics
 from slam.simulation.options import SimulationOptions
-from slam.simulation.painter import Hits, paint
 from slam.simulation.route import RouteKind, plan_route
-from slam.simulation.surface import Surface, place_rays
+from slam.simulation.sensors import T_CAMERA_LIDAR, beam_directions, kitti_intrinsics, measured, square_intrinsics
+from slam.simulation.surface import Hits, Surface, place_rays
 from slam.simulation.town import build_town
 from slam.simulation.variety import draw_variety
 from slam.simulation.world import SimulatedWorld, in_bytes, through_lens

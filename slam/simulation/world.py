@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from slam.geometry import se3
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh
-from slam.simulation.optics import pixel_rays
 from slam.simulation.options import SimulationOptions
-from slam.simulation.painter import Hits, facing_normals
-from slam.simulation.surface import Surface, distances, place_rays
+from slam.simulation.sensors import pixel_rays
+from slam.simulation.surface import Hits, Surface, distances, facing_normals, place_rays
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 

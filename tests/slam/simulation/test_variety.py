@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
+from slam.simulation.optics import pixel_rays
 
 from slam.geometry import se3
 from slam.simulation.geometry import FLAT, Material, Soup
-from slam.simulation.optics import pixel_rays
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 from slam.simulation.surface import Surface, place_rays

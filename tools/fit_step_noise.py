@@ -31,7 +31,7 @@ from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable
 from slam.geometry.se3 import FloatArray, invert, umeyama
 from slam.pipeline.batch import SlamPipeline
-from slam.prediction.networks import NetworkPredictor
+from slam.prediction.assembly import NetworkPredictor
 from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
 

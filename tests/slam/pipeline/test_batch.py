@@ -28,7 +28,7 @@ from slam.geometry.se3 import FloatArray
 from slam.pipeline import batch
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
-from slam.prediction.networks import NetworkPredictor
+from slam.prediction.assembly import NetworkPredictor
 from slam.runtime.errors import SlamError
 from slam.runtime.storage.record import Missing
 from slam.sequences.excerpt import Excerpt

@@ -140,7 +140,7 @@ class FolderRecorder(Recorder):
         self._progress("report", 1, 1)
 
     def fail(self, error: BaseException) -> str:
-        """Write the reason of a failure, which is returned; errors of writing it are ignored, for the first is raised."""
+        """Write the reason of a failure and return it; an error of writing it is ignored, for the first is raised."""
         reason = explained(error) if isinstance(error, Exception) else str(error) or type(error).__name__
         with suppress(SlamError, OSError):
             self.folder.write_metrics(self._metrics.changed(status="failed", reason=reason))

@@ -160,28 +160,27 @@ def _print_run(path: Path, metrics: Metrics) -> None:
     from slam.results.report.verdict import verdict
     from slam.results.terminal_tables import metrics_table
     from slam.runtime.run_files import REPORT
-    from slam.runtime.storage.record import Missing, known
 
     sequence, provenance, timing = metrics.sequence, metrics.provenance, metrics.timing
-    title = f"{known(sequence.name)}, scale {known(metrics.scale.mode)}"
-    if isinstance(sequence.length_m, Missing):
-        typer.echo(f"{title}: no errors, for {sequence.length_m.reason}")
+    title = f"{sequence.name}, scale {metrics.scale.mode}"
+    if sequence.length_m is None:
+        typer.echo(f"{title}: no errors, for {sequence.why('length_m')}")
     else:
         print_table(metrics_table(metrics.evaluated_errors(), title))
-    if (sure := known(metrics.confidence.run)) is not None:
+    if (sure := metrics.confidence.run) is not None:
         typer.echo(f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path")
     if (found := verdict(metrics)) is not None and found.doubts:
         typer.echo(f"doubts: {'; '.join(found.doubts)}")
     for note in metrics.unit_notes():
         typer.echo(note)
-    for gap in sequence.bridged:
+    for gap in sequence.bridged or ():
         typer.echo(f"INTERPOLATED: frames {gap.first} to {gap.last}: {gap.reason}")
-    depth = "" if provenance.depth_source == "network" else f"; depth {known(provenance.depth_source)}"
-    typer.echo(f"weights {known(provenance.weights)}: {known(provenance.weights_licence)}{depth}")
+    depth = "" if provenance.depth_source == "network" else f"; depth {provenance.depth_source}"
+    typer.echo(f"weights {provenance.weights}: {provenance.weights_licence}{depth}")
     seconds, per_second = written(timing.seconds_total, 1), written(timing.frames_per_second, 1)
     report = path / REPORT
     typer.echo(
-        f"{known(sequence.frames) or 0} frames in {seconds} s ({per_second} a second); everything in {path}"
+        f"{sequence.frames or 0} frames in {seconds} s ({per_second} a second); everything in {path}"
         + (f", read {report}" if report.is_file() else "")
     )
 

@@ -8,18 +8,17 @@ from html import escape
 from slam.results.error_columns import COLUMNS, written
 from slam.results.folder import RunFolder
 from slam.runtime.run_files import REPORT
-from slam.runtime.storage.record import known
 
 
 def html(run: RunFolder) -> str:
     """The run as a piece of HTML without scripts."""
     metrics = run.metrics()
     rows = [
-        [name, *(written(column.value(errors), column.decimals) for column in COLUMNS)]
+        [name, *(written(errors.at(column.path)[0], column.decimals) for column in COLUMNS)]
         for name, errors in metrics.evaluated_errors().items()
     ]
     table = _row(["", *(column.name for column in COLUMNS)], "th") + "".join(_row(row, "td") for row in rows)
-    title = f"{known(metrics.sequence.name) or run.path.name}: {known(metrics.sequence.frames) or 0} frames"
+    title = f"{metrics.sequence.name or run.path.name}: {metrics.sequence.frames or 0} frames"
     notes = [note for note in (metrics.failure, *metrics.unit_notes()) if note]
     if (run.path / REPORT).is_file():
         notes.append(f"Report: {run.path / REPORT}")

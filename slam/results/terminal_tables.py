@@ -5,28 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from slam.evaluation.trajectory import TrajectoryMetrics
 from slam.results.error_columns import (
     COLUMNS,
     DASH,
     EVO_DIFFERENCE,
     SNIPPET_ATE,
     ErrorColumn,
-    Errors,
     missing_by_reason,
     written,
 )
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
-from slam.runtime.storage.record import Missing, known
 from slam.runtime.terminal import TerminalTable
 
 UNITS = "Snippet ATE (norm / 5), ATE RMSE and RPE (mean) in metres; snippet RE in radians; r_rel in degrees per 100 m."
-_EVO_APE = ErrorColumn(lambda e: e.evo.ape_rmse_m_7dof, "APE RMSE by evo, 7 dof", "evo APE\n7dof", 3)
+_EVO_APE = ErrorColumn("evo.ape_rmse_m_7dof", "APE RMSE by evo, 7 dof", "evo APE\n7dof", 3)
 _ONE_RUN = (*COLUMNS[:-1], _EVO_APE, EVO_DIFFERENCE)
 
 
-def metrics_table(trajectories: Mapping[str, Errors], title: str) -> TerminalTable:
+def metrics_table(trajectories: Mapping[str, TrajectoryMetrics], title: str) -> TerminalTable:
     """One row a trajectory, in the order given; below, the reasons of missing numbers.
 
     Args:
@@ -34,7 +33,7 @@ def metrics_table(trajectories: Mapping[str, Errors], title: str) -> TerminalTab
         title: what was compared, with the scale mode, which decides the unit of lengths.
     """
     rows = [
-        [name, *(c.text(errors) if c is SNIPPET_ATE else written(c.value(errors), c.decimals) for c in _ONE_RUN)]
+        [name, *(c.text(errors) if c is SNIPPET_ATE else written(errors.at(c.path)[0], c.decimals) for c in _ONE_RUN)]
         for name, errors in trajectories.items()
     ]
     reasons = missing_by_reason(trajectories, _ONE_RUN)
@@ -61,7 +60,7 @@ def comparison_table(runs: Sequence[RunFolder]) -> TerminalTable:
             title += ", LEAK"
             notes["LEAK: the weights were trained on the sequence; the numbers are no test."] = None
         for each, found in errors.items():
-            rows.append([title, each, *(written(c.value(found), c.decimals) for c in COLUMNS)])
+            rows.append([title, each, *(written(found.at(c.path)[0], c.decimals) for c in COLUMNS)])
         if errors:
             for why, where in missing_by_reason(metrics.all_errors(), COLUMNS).items():
                 notes[f"{DASH} {name}, {' and '.join(where)}: {why}."] = None
@@ -84,7 +83,7 @@ def comparison_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
         entry: dict[str, Any] = {"run": str(run.path), "status": metrics.status}
         if metrics.failure:
             entry["reason"] = metrics.failure
-        entry["leak"] = known(metrics.provenance.leak)
+        entry["leak"] = metrics.provenance.leak
         objects.append(entry | {key: tree.get(key) for key in ("sequence", "scale", "trajectories")})
     return objects
 
@@ -104,7 +103,7 @@ def _contents(runs: Sequence[RunFolder]) -> list[Metrics]:
 def _metrics(run: RunFolder) -> Metrics:
     """The metrics of a run; where it was killed before it wrote them, those of its trajectories."""
     metrics = run.metrics()
-    if isinstance(metrics.trajectories, Missing) and run.trajectory("optimised") is not None:
+    if metrics.trajectories.absent and run.trajectory("optimised") is not None:
         from slam.results.estimate_metrics import metrics_of_trajectories
 
         return metrics.changed(trajectories=metrics_of_trajectories(run))

@@ -15,7 +15,6 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import Missing, known
 from slam.runtime.terminal import TerminalTable
 
 CSV = "drives.csv"
@@ -27,7 +26,7 @@ _COLUMNS: tuple[tuple[str, Callable[[Metrics], object], int], ...] = (
     ("length_m", lambda m: m.sequence.length_m, 0),
     ("scale", lambda m: m.scale.mode, 0),
     ("unit", lambda m: m.unit, 0),
-    ("ate_6dof_m", lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else Missing(), 3),
+    ("ate_6dof_m", lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else None, 3),
     ("ate_7dof_m", lambda m: m.trajectories.optimised.align.dof7.ate_rmse_m, 3),
     ("t_rel_percent", lambda m: m.trajectories.optimised.align.dof7.t_rel_percent, 2),
     ("r_rel_deg_per_100m", lambda m: m.trajectories.optimised.align.dof7.r_rel_deg_per_100m, 3),
@@ -91,4 +90,4 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     if outcome.status == "failed":
         return row | {name: None for name, _, _ in _COLUMNS}
     metrics = RunFolder(outcome.folder).metrics()
-    return row | {name: known(value(metrics)) for name, value, _ in _COLUMNS}
+    return row | {name: value(metrics) for name, value, _ in _COLUMNS}

@@ -20,7 +20,6 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
-from slam.runtime.storage.record import known
 
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
 _RESOLUTION = 0.1  # of an occupancy grid
@@ -105,7 +104,7 @@ def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     trajectory = folder.trajectory("optimised")
     if trajectory is None:
         raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
-    frames = known(folder.metrics().sequence.frames)
+    frames = folder.metrics().sequence.frames
     if frames is not None and frames != len(trajectory):
         raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
     if up != "y-down":

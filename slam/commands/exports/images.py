@@ -20,7 +20,6 @@ from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import PLACES
 from slam.runtime.storage.files import remove, write_atomically
-from slam.runtime.storage.record import Missing, known
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 
@@ -89,7 +88,7 @@ def image_name(frame: int) -> str:
 
 def is_recorded(folder: RunFolder) -> bool:
     """Whether a run says where its images are."""
-    return not isinstance(folder.metrics().provenance.recording, Missing)
+    return not folder.metrics().provenance.recording.absent
 
 
 def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:
@@ -121,18 +120,18 @@ def _rows(folder: RunFolder, trajectory: Trajectory, sequence: Sequence) -> list
 def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:
     """Arguments of `open_sequence`, as recorded by the run."""
     recorded = folder.metrics().provenance.recording
-    if isinstance(recorded, Missing) and dataset is None:
+    if recorded.absent and dataset is None:
         raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
-    camera = None if isinstance(recorded.camera, Missing) else Path(recorded.camera)
+    camera = None if recorded.camera is None else Path(recorded.camera)
     if dataset is None:
-        place = None if isinstance(recorded.dataset, Missing) else Path(recorded.dataset)
+        place = None if recorded.dataset is None else Path(recorded.dataset)
     else:
         place = dataset
         if camera is not None and not (camera.exists() or is_field_of_view(camera)):
             camera = None  # it may have moved with the images
-    return {"dataset": place, "name": known(recorded.sequence), "camera": camera}
+    return {"dataset": place, "name": recorded.sequence, "camera": camera}
 
 
 def interpolated(folder: RunFolder) -> set[int]:
     """Frames of a run without a usable image."""
-    return {k for gap in folder.metrics().sequence.bridged for k in range(gap.first, gap.last + 1)}
+    return {k for gap in folder.metrics().sequence.bridged or () for k in range(gap.first, gap.last + 1)}

@@ -18,7 +18,6 @@ from slam.results.folder import RunFolder
 from slam.results.output_file import check_replaced
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import CONFIG
-from slam.runtime.storage.record import known
 
 # from a camera's x right, y down, z ahead
 R_UP_WORLDS: dict[str, FloatArray] = {
@@ -118,5 +117,5 @@ def _is_in_recording(folder: RunFolder, output: Path) -> bool:
     began = folder.path / CONFIG
     if not began.is_file() or output.stat().st_mtime > began.stat().st_mtime:
         return False
-    dataset = known(folder.metrics().provenance.recording.dataset)
+    dataset = folder.metrics().provenance.recording.dataset
     return dataset is not None and output.resolve().is_relative_to(Path(dataset).resolve())

@@ -31,7 +31,6 @@ from slam.runtime.attempt import Failed, attempt
 from slam.runtime.errors import EmptyMapError, SlamError
 from slam.runtime.run_files import CONFIG, GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
 from slam.runtime.storage.files import from_anywhere
-from slam.runtime.storage.record import Missing
 
 logger = logging.getLogger(__name__)
 
@@ -111,16 +110,17 @@ class FolderRecorder(Recorder):
             surface.write_cloud(self.folder.path / MAP_CLOUD)
         with self._stopwatch.stage("evaluation"):
             metric = estimate.scale.is_metric
-            share = double_wall_share(surface.meshes()) if metric else Missing("lengths are not in metres")
+            share = double_wall_share(surface.meshes()) if metric else Failed("lengths are not in metres")
             pieces = lambda: (Ply(piece).points for piece in surface.cloud_pieces())  # noqa: E731
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
         sizes = asdict(estimate.map.statistics())
-        self._metrics = self._metrics.changed(map=MapMetrics(**sizes, double_wall_share=share, **dict(errors)))
+        found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
+        self._metrics = self._metrics.changed(map=found)
 
     def no_map(self, reason: str) -> None:
         """The reason is its metric."""
-        self._metrics = self._metrics.changed(map=MapMetrics.missing(reason))
+        self._metrics = self._metrics.changed(map=MapMetrics.unknown(reason))
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""
@@ -140,7 +140,7 @@ class FolderRecorder(Recorder):
         self._progress("report", 1, 1)
 
     def fail(self, error: BaseException) -> str:
-        """Write the reason of a failure, which is returned; errors of writing it are ignored, for the first is raised."""
+        """Write the reason of a failure, which is returned; errors of writing are ignored, for the first is raised."""
         reason = explained(error) if isinstance(error, Exception) else str(error) or type(error).__name__
         with suppress(SlamError, OSError):
             self.folder.write_metrics(self._metrics.changed(status="failed", reason=reason))

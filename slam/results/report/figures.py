@@ -17,7 +17,6 @@ from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
 from slam.results.metrics import AcceptedLoop, CoverageMetrics, Stretch
 from slam.results.report.map_view import MapView
 from slam.runtime.run_files import REFERENCE
-from slam.runtime.storage.record import known
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito (2008): for every eye
 LOOKS: dict[str, tuple[str, str | None, float, str]] = {  # label, colour (None: that of text), width, dash
@@ -177,10 +176,10 @@ def motion_figure(trajectories: Mapping[str, Trajectory], unit: str, gaps: Itera
 def noise_figure(coverage: CoverageMetrics, by_source: Mapping[str, CoverageMetrics]) -> go.Figure:
     """Share of factors inside the bounds of their stated noise, beside what the bounds promise."""
     named = {"all": coverage} | dict(by_source)
-    names = [f"{name}<br>{number}" if (number := known(each.factors)) else name for name, each in named.items()]
+    names = [f"{name}<br>{number}" if (number := each.factors) else name for name, each in named.items()]
     figure = go.Figure()
     for level, colour in zip(LEVELS, COLOURS[::-1]):
-        shares = [100.0 * (known(getattr(each, f"inside_{level}")) or 0.0) for each in named.values()]
+        shares = [100.0 * (getattr(each, f"inside_{level}") or 0.0) for each in named.values()]
         words = f"%{{y:.0f}} % inside the {level} % bound<extra>%{{x}}</extra>"
         bar = {"name": f"{level} % bound", "marker": {"color": colour}, "hovertemplate": words}
         figure.add_trace(go.Bar(x=names, y=shares, **bar))

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from slam.evaluation.map import Ring, SurfaceMetrics
-from slam.results.metrics import MapSizes, Metrics
+from slam.evaluation.map import SurfaceMetrics
+from slam.results.metrics import SIZES, Metrics
 from slam.results.report.tables import Cell, Table, notes_on, number
-from slam.runtime.storage.record import Missing, known
 
-_Value = Callable[[SurfaceMetrics | Missing], float | Missing]
-_ERRORS: dict[str, _Value] = {
-    "accuracy, median\u00a0(m)": lambda m: m.accuracy_median_m,
-    "accuracy, 90\u00a0%\u00a0(m)": lambda m: m.accuracy_90_m,
-    "over 1\u00a0m": lambda m: m.outlier_share,
-    "completeness, 0.3\u00a0m": lambda m: m.completeness,
-    "F-score, 0.2\u00a0m": lambda m: m.f_score.m02,
-    "F-score, 0.5\u00a0m": lambda m: m.f_score.m05,
+_ERRORS = {
+    "accuracy, median\u00a0(m)": "accuracy_median_m",
+    "accuracy, 90\u00a0%\u00a0(m)": "accuracy_90_m",
+    "over 1\u00a0m": "outlier_share",
+    "completeness, 0.3\u00a0m": "completeness",
+    "F-score, 0.2\u00a0m": "f_score.m02",
+    "F-score, 0.5\u00a0m": "f_score.m05",
 }
 _FILTERS = {
     "unknown": "no depth",
@@ -39,15 +37,15 @@ _TRUTHS = {
 def map_sizes(metrics: Metrics) -> Table | None:
     """Every count of the map; None without one, and the reason alone where fusion was left out."""
     found = metrics.map
-    if isinstance(found, Missing):
+    if found.absent:
         return None
-    if isinstance(found.triangles, Missing):
-        return Table((), [], notes=notes_on([f"map: {found.triangles.reason}"]))
-    counts = {name: getattr(found, name) for name in MapSizes.model_fields if name in found.model_fields_set}
+    if found.triangles is None:
+        return Table((), [], notes=notes_on([f"map: {found.why('triangles')}"]))
     cells = {
-        name.replace("_", " "): number(value)
-        for name, value in counts.items()
-        if isinstance(value, int) or name in ("points", "blocks")
+        name.replace("_", " "): number(found, name)
+        for name in SIZES
+        if name in found.model_fields_set
+        if isinstance(getattr(found, name), int) or name in ("points", "blocks")
     }
     missing = [f"{name}: {cell.tooltip}" for name, cell in cells.items() if cell.tooltip]
     return Table((), [[Cell(name), cell] for name, cell in cells.items()], "words", notes_on(missing))
@@ -55,7 +53,7 @@ def map_sizes(metrics: Metrics) -> Table | None:
 
 def map_filters(metrics: Metrics) -> Table | None:
     """The share of pixels that each filter took before fusion, and what cleaning the mesh took; None without a map."""
-    filters = known(metrics.map.filters)
+    filters = metrics.map.filters
     if filters is None:
         return None
     rows: list[Sequence[Cell] | str] = [
@@ -68,7 +66,7 @@ def map_filters(metrics: Metrics) -> Table | None:
         ("floaters", metrics.map.floater_share, loose),
         ("double walls", metrics.map.double_wall_share, double),
     ):
-        if not isinstance(part, Missing):
+        if part is not None:
             rows.append([Cell(name), Cell(f"{part:.1%}"), Cell(what)])
     return Table(["filter", "share", "of the keyframes' pixels, one filter after another"], rows, "words")
 
@@ -76,31 +74,31 @@ def map_filters(metrics: Metrics) -> Table | None:
 def map_errors_table(metrics: Metrics) -> Table | None:
     """Errors of the map under both alignments, and by distance from the camera; None without a map."""
     found = metrics.map
-    if isinstance(found, Missing) or isinstance(found.triangles, Missing):
+    if found.triangles is None:
         return None
-    if isinstance(found.truth, Missing):
-        return Table((), [], notes=notes_on([f"error of the map: {found.truth.reason}"]))
+    if found.truth is None:
+        return Table((), [], notes=notes_on([f"error of the map: {found.why('truth')}"]))
     rows: list[Sequence[Cell] | str] = [_row("one rigid motion", found)]
-    if not isinstance(found.in_field.share, Missing) and found.in_field.share != 1.0:
+    if found.in_field.share not in (None, 1.0):
         rows.append(_row("where the scanner looked", found.in_field))
     rows.append(_row("with one scale", found.with_scale))
     rings = _rings(metrics)
     if rings:
-        is_rigid = not isinstance(found.by_distance, Missing)
+        is_rigid = found.by_distance is not None
         rows.append("By distance from the nearest camera" + ("" if is_rigid else ", with one scale"))
-        rows += [_row(f"{known(ring.from_m):.0f} to {known(ring.to_m):.0f} m", ring) for ring in rings]
-    length = number(found.evaluated_m).text
+        rows += [_row(f"{ring.from_m:.0f} to {ring.to_m:.0f} m", ring) for ring in rings]
+    length = number(found, "evaluated_m").text
     truth = _TRUTHS.get(found.truth, found.truth)
     words = f"Against {truth}, {length} m of road. Map where no surface was measured is an error."
-    missing = (number(value(found)).tooltip for value in _ERRORS.values())
+    missing = (number(found, name).tooltip for name in _ERRORS.values())
     return Table(["", *_ERRORS], rows, notes=[words, *notes_on(missing)])
 
 
-def _row(name: str, errors: SurfaceMetrics | Missing) -> list[Cell]:
-    return [Cell(name), *(number(value(errors), 3) for value in _ERRORS.values())]
+def _row(title: str, errors: SurfaceMetrics) -> list[Cell]:
+    return [Cell(title), *(number(errors, name, 3) for name in _ERRORS.values())]
 
 
-def _rings(metrics: Metrics) -> list[Ring]:
+def _rings(metrics: Metrics) -> list[SurfaceMetrics]:
     """The curve of the rigidly moved map, or of the scaled one where lengths are not in metres."""
     rigid = metrics.map.by_distance
-    return list(metrics.map.with_scale.by_distance if isinstance(rigid, Missing) else rigid)
+    return (metrics.map.with_scale.by_distance if rigid is None else rigid) or []

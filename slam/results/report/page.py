@@ -18,7 +18,7 @@ from slam.results.report.tables import Cell, Table, number
 from slam.results.report.verdict import verdict
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import LOOPS, MEANINGS, REFERENCE, REPORT, TRAJECTORIES
-from slam.runtime.storage.record import MISSING, Missing, known
+from slam.runtime.storage.record import NOT_RECORDED, Record
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -55,11 +55,11 @@ def write_report(
     metrics, loops_file = metrics or folder.metrics(), _loops_file(folder)
     page = render(
         "page.html.j2",
-        name=known(metrics.sequence.name) or folder.path.resolve().name,
+        name=metrics.sequence.name or folder.path.resolve().name,
         failure=metrics.failure,
         verdict=verdict(metrics),
         leak=metrics.provenance.leak is True,
-        version=known(metrics.provenance.version) or "",
+        version=metrics.provenance.version or "",
         unit_notes=metrics.unit_notes(),
         key_numbers=[] if metrics.failure else report_tables.key_numbers(metrics),
         what_ran=report_tables.what_ran(metrics),
@@ -93,11 +93,9 @@ def _loops_file(folder: RunFolder) -> LoopsFile:
         return LoopsFile()
 
 
-def _absence(metrics: Metrics, part: object) -> str:
+def _absence(metrics: Metrics, part: Record) -> str:
     """Why a run has no such part; empty where it has one, or failed before."""
-    if not isinstance(part, Missing) or (metrics.failure and part == MISSING):
-        return ""
-    return part.reason
+    return "" if metrics.failure and part.absent == NOT_RECORDED else part.absent
 
 
 def _plots(
@@ -116,7 +114,7 @@ def _plots(
 
     has_truth = REFERENCE in trajectories and len(trajectories) > 1
     unit = "m" if metrics.unit == METRES else metrics.unit
-    gaps, accepted = known(metrics.sequence.bridged) or [], known(loops.accepted) or []
+    gaps, accepted = metrics.sequence.bridged or [], loops.accepted or []
     if trajectories:
         given = (trajectories, "m" if has_truth else unit, accepted)
         caption = _ALIGNED if has_truth else _AS_WRITTEN
@@ -139,15 +137,15 @@ def _plots(
             "Drag to turn it, with the right button to move it; the wheel zooms."
         )
         add("map", "Map", caption, figures.map_figure, view)
-    if (coverage := known(metrics.graph.coverage)) is not None:
-        by_source = known(metrics.graph.coverage_by_source) or {}
+    if not (coverage := metrics.graph.coverage).absent:
+        by_source = metrics.graph.coverage_by_source or {}
         add("noise", "Stated noise", _NOISE, figures.noise_figure, coverage, by_source)
     return found
 
 
 def _depth_error(metrics: Metrics) -> Table | None:
     """Error of learned depth over distance; None where it was not measured."""
-    rows = list(metrics.depth_error)
+    rows = metrics.depth_error
     if not rows:
         return None
     words = (
@@ -155,12 +153,11 @@ def _depth_error(metrics: Metrics) -> Table | None:
         "compared with image geometry. It is zero on average, for its scale is measured step by step."
     )
     head = ("learned depth", "bias", "relative sigma", "corners")
-    cells = [[number(row.depth, 1), _signed(row.bias), number(row.sigma, 2), number(row.corners)] for row in rows]
+    cells = [
+        [number(row, "depth", 1), Cell(f"{row.bias or 0.0:+.2f}"), number(row, "sigma", 2), number(row, "corners")]
+        for row in rows
+    ]
     return Table(head, cells, notes=[words])
-
-
-def _signed(value: float | Missing) -> Cell:
-    return number(value) if isinstance(value, Missing) else Cell(f"{value:+.2f}")
 
 
 def _files(folder: RunFolder) -> Table | None:

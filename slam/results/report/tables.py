@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from slam.evaluation.trajectory import ALIGNMENTS
 from slam.results.error_columns import (
     ALIGNED_ATE,
     COLUMNS,
@@ -22,7 +23,7 @@ from slam.results.error_columns import (
 )
 from slam.results.metrics import CAMERA_HEIGHTS, METRES, GpsErrors, LoopsFile, Metrics, Stretch
 from slam.runtime.run_files import LOOPS, METRICS
-from slam.runtime.storage.record import NOT_RECORDED, Missing, known
+from slam.runtime.storage.record import NOT_RECORDED, Record
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,6 @@ class Table:
 
 
 MOST_LOOPS = 40
-_ALIGNMENTS = {"dof6": "6dof", "dof7": "7dof"}
 _PER_ALIGNMENT = (
     ("ate_rmse_m", "ATE RMSE, m", 3),
     ("t_rel_percent", "t_rel, %", 2),
@@ -58,10 +58,11 @@ _PER_ALIGNMENT = (
 )
 
 
-def number(value: Any, decimals: int = 0) -> Cell:
+def number(record: Record, path: str, decimals: int = 0) -> Cell:
     """A value of the metrics as a cell; a dash with its reason as a tooltip where it is missing."""
-    if isinstance(value, Missing):
-        return Cell(DASH, value.reason, "missing")
+    value, reason = record.at(path)
+    if value is None:
+        return Cell(DASH, reason, "missing")
     return Cell(f"{value:,}" if isinstance(value, int) else written(value, decimals))
 
 
@@ -70,13 +71,13 @@ def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
     best = metrics.trajectories.optimised
     fitted = ("dof6", "m, 6 dof") if metrics.is_metric else ("dof7", "m, 7 dof")
     wanted = [
-        ("Position error", number(getattr(best.align, fitted[0]).ate_rmse_m, 2), fitted[1]),
-        ("Drift, t_rel", number(T_REL.value(best), 2), "%"),
-        ("Path", number(metrics.sequence.length_m), "m"),
-        ("Frames", number(metrics.sequence.frames), ""),
-        ("Speed", number(metrics.timing.frames_per_second, 1), "frames/s"),
-        ("Loops accepted", number(metrics.loops.accepted), ""),
-        ("Map triangles", number(metrics.map.triangles), ""),
+        ("Position error", number(best, f"align.{fitted[0]}.ate_rmse_m", 2), fitted[1]),
+        ("Drift, t_rel", number(best, T_REL.path, 2), "%"),
+        ("Path", number(metrics, "sequence.length_m"), "m"),
+        ("Frames", number(metrics, "sequence.frames"), ""),
+        ("Speed", number(metrics, "timing.frames_per_second", 1), "frames/s"),
+        ("Loops accepted", number(metrics, "loops.accepted"), ""),
+        ("Map triangles", number(metrics, "map.triangles"), ""),
     ]
     return [(name, cell, unit) for name, cell, unit in wanted if cell.style != "missing"]
 
@@ -84,28 +85,28 @@ def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
 def what_ran(metrics: Metrics) -> Table:
     """Sequence, weights, scale and command; a run that failed early has fewer rows."""
 
-    def text(value: Any, decimals: int = 1, unit: str = "", most: int | None = None) -> str:
-        missing = f"{DASH} ({value.reason})" if isinstance(value, Missing) else ""
-        return missing or f"{written(value, decimals)[:most]}{unit}"
+    def text(path: str, decimals: int = 1, unit: str = "", most: int | None = None) -> str:
+        value, reason = metrics.at(path)
+        return f"{DASH} ({reason})" if value is None else f"{written(value, decimals)[:most]}{unit}"
 
     sequence, ran = metrics.sequence, metrics.provenance
     rows = [
-        ("Sequence", f"{text(sequence.name)}, {text(sequence.frames)} frames"),
+        ("Sequence", f"{text('sequence.name')}, {text('sequence.frames')} frames"),
         ("Interpolated frames", _stretches(sequence.bridged) or "none"),
         *([("Doubled frames", doubled)] if (doubled := _stretches(sequence.doubled)) else []),
         *([("LiDAR scans left out", left_out)] if (left_out := _stretches(sequence.unreadable_scans)) else []),
-        ("True length", text(sequence.length_m, unit=" m")),
-        ("Frame rate", text(sequence.fps, unit=" frames/s")),
+        ("True length", text("sequence.length_m", unit=" m")),
+        ("Frame rate", text("sequence.fps", unit=" frames/s")),
         ("Scale", _scale(metrics)),
-        ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
-        ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
+        ("Speed", text("timing.frames_per_second", unit=" frames/s over the whole run")),
+        ("Weights", f"{text('provenance.weights')}, sha256 {text('provenance.weights_sha256', most=16)}"),
         ("Depth", _depth_source(metrics)),
-        ("Licence of the weights", text(ran.weights_licence)),
-        ("Trained on", _shortened(list(ran.trained_on)) or DASH),
-        ("Leak", {True: "yes: trained on this sequence", False: "none known", None: DASH}[known(ran.leak)]),
-        ("Command", text(ran.command)),
-        ("Seed, device", f"{text(ran.seed)}, {text(ran.device)}"),
-        ("Version, commit", f"{text(ran.version)}, {text(ran.commit)}"),
+        ("Licence of the weights", text("provenance.weights_licence")),
+        ("Trained on", _shortened(ran.trained_on or ()) or DASH),
+        ("Leak", {True: "yes: trained on this sequence", False: "none known", None: DASH}[ran.leak]),
+        ("Command", text("provenance.command")),
+        ("Seed, device", f"{text('provenance.seed')}, {text('provenance.device')}"),
+        ("Version, commit", f"{text('provenance.version')}, {text('provenance.commit')}"),
     ]
     recorded = [row for row in rows if NOT_RECORDED not in row[1]] if metrics.failure else rows
     return Table((), _texts(recorded), "words")
@@ -113,36 +114,36 @@ def what_ran(metrics: Metrics) -> Table:
 
 def _scale(metrics: Metrics) -> str:
     scale = metrics.scale
-    if isinstance(scale.value, Missing):
-        return f"mode {known(scale.mode) or DASH}, {scale.value.reason}"
-    spread, frames = known(scale.spread), known(scale.frames_used)
+    if scale.value is None:
+        return f"mode {scale.mode or DASH}, {scale.why('value')}"
+    spread, frames = scale.spread, scale.frames_used
     unit = metrics.unit if metrics.unit in (METRES, CAMERA_HEIGHTS) else "units of the result"
     certain = "" if spread is None else f", spread {100 * spread:.1f} %"
     used = "" if frames is None else f", measured in {frames} frames"
-    return f"mode {known(scale.mode)}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
+    return f"mode {scale.mode}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
 
 
 def gps(metrics: Metrics) -> Table | None:
     """Distances from the GPS track; None without one."""
     found = metrics.gps
-    if isinstance(found, Missing):
+    if found.absent:
         return None
 
-    def row(name: str, errors: GpsErrors | Missing) -> list[Cell]:
-        values = (errors.horizontal_rmse_m, errors.horizontal_median_m, errors.vertical_rmse_m)
-        return [Cell(name), *(number(value, 2) for value in values)]
+    def row(name: str, errors: GpsErrors) -> list[Cell]:
+        values = ("horizontal_rmse_m", "horizontal_median_m", "vertical_rmse_m")
+        return [Cell(name), *(number(errors, value, 2) for value in values)]
 
     factors = "factors of the pose graph: the optimised row is no independent test"
     use = factors if found.in_graph is True else "not in the pose graph"
-    notes = [f"{known(found.fixes)} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
+    notes = [f"{found.fixes} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
     head = ("", "horizontal RMSE, m", "horizontal median, m", "vertical RMSE, m")
     return Table(head, [row("odometry", found.odometry), row("optimised", found.optimised)], notes=notes)
 
 
 def no_errors(metrics: Metrics) -> str:
     """Why no trajectory has an error; empty where one has, or where nothing was evaluated."""
-    values = [column.value(errors) for column in COLUMNS for errors in metrics.evaluated_errors().values()]
-    missing = [value.reason for value in values if isinstance(value, Missing)]
+    values = [errors.at(column.path) for column in COLUMNS for errors in metrics.evaluated_errors().values()]
+    missing = [reason for value, reason in values if value is None]
     return missing[0] if values and len(missing) == len(values) else ""
 
 
@@ -153,11 +154,11 @@ def errors(metrics: Metrics) -> Table | None:
         return None
 
     def row(column: ErrorColumn) -> list[Cell]:
-        values = [column.value(each) for each in evaluated.values()]
-        numbers = {value for value in values if not isinstance(value, Missing)}
+        values = [each.at(column.path)[0] for each in evaluated.values()]
+        numbers = {value for value in values if value is not None}
         least = min(numbers) if column is not EVO_DIFFERENCE and len(numbers) > 1 else None
-        cells = [number(value, column.decimals) for value in values]
-        styles = ["best" if value == least else cell.style for value, cell in zip(values, cells)]
+        cells = [number(each, column.path, column.decimals) for each in evaluated.values()]
+        styles = ["best" if value is not None and value == least else cell.style for value, cell in zip(values, cells)]
         texts = [column.text(each) for each in evaluated.values()]
         return [
             Cell(column.name),
@@ -186,28 +187,28 @@ def alignments(metrics: Metrics) -> Table | None:
         return None
     rows: list[Sequence[Cell] | str] = []
     for name, found in metrics.evaluated_errors().items():
-        if isinstance(found.align, Missing):
+        if found.align.absent:
             continue
         rows.append(name)
-        for how, each in found.align:
-            cells = [number(getattr(each, key), decimals) for key, _, decimals in _PER_ALIGNMENT]
-            rows.append([Cell(_ALIGNMENTS.get(how, how)), *cells])
+        for how in ALIGNMENTS:
+            cells = [number(found, f"align.{how}.{key}", decimals) for key, _, decimals in _PER_ALIGNMENT]
+            rows.append([Cell(how), *cells])
     return Table(["alignment", *(label for _, label, _ in _PER_ALIGNMENT)], rows) if rows else None
 
 
 def loops(metrics: Metrics, details: LoopsFile) -> dict[str, Any] | None:
     """``counts`` of loops, ``reasons`` of those that are missing, and a ``table`` of the accepted and the rejected."""
     found = metrics.loops
-    if isinstance(found, Missing):
+    if found.absent:
         return None
-    stages = {"candidates": found.candidates, "verified": found.verified, "accepted": found.accepted}
+    stages = {name: number(found, name) for name in ("candidates", "verified", "accepted")}
     groups = (("accepted", details.accepted), ("rejected", found.rejected))
-    rows = [(str(loop.from_), str(loop.to), verdict, loop.reason) for verdict, group in groups for loop in group]
-    left_out = known(details.rejected_left_out)
+    rows = [(str(loop.from_), str(loop.to), verdict, loop.reason) for verdict, group in groups for loop in group or ()]
+    left_out = details.rejected_left_out
     where = LOOPS + (f", without {left_out} rejected ones of fewest inliers" if left_out else "")
     return {
-        "counts": ", ".join(f"{number(value).text} {stage}" for stage, value in stages.items()),
-        "reasons": notes_on(number(value).tooltip for value in stages.values()),
+        "counts": ", ".join(f"{cell.text} {stage}" for stage, cell in stages.items()),
+        "reasons": notes_on(cell.tooltip for cell in stages.values()),
         "table": _first_of(("from frame", "to frame", "verdict", "reason"), rows, where),
     }
 
@@ -215,14 +216,14 @@ def loops(metrics: Metrics, details: LoopsFile) -> dict[str, Any] | None:
 def tracking(metrics: Metrics) -> dict[str, Any] | None:
     """``counts`` of keyframes and maps, and a ``table`` of what became of them; None without keyframes."""
     found = metrics.tracking
-    if isinstance(found, Missing):
+    if found.absent:
         return None
     rows = [
         ["" if value is None else str(value) for value in (event.frame, event.event, event.other, event.support)]
-        for event in found.events
+        for event in found.events or ()
     ]
     return {
-        "counts": f"{number(found.keyframes).text} keyframes, {number(found.maps).text} maps",
+        "counts": f"{number(found, 'keyframes').text} keyframes, {number(found, 'maps').text} maps",
         "table": _first_of(("frame", "event", "at the place of frame", "points or loops"), rows, METRICS),
     }
 
@@ -230,26 +231,26 @@ def tracking(metrics: Metrics) -> dict[str, Any] | None:
 def graph(metrics: Metrics) -> dict[str, Any] | None:
     """``nodes`` and ``factors`` of the pose graph, and the ``reasons`` why its noise is not covered."""
     found = metrics.graph
-    if isinstance(found, Missing):
+    if found.absent:
         return None
-    reasons = notes_on([f"coverage: {found.coverage.reason}"]) if isinstance(found.coverage, Missing) else []
-    return {"nodes": number(found.nodes).text, "factors": number(found.factors).text, "reasons": reasons}
+    reasons = notes_on([f"coverage: {found.coverage.absent}"]) if found.coverage.absent else []
+    return {"nodes": number(found, "nodes").text, "factors": number(found, "factors").text, "reasons": reasons}
 
 
 def timing(metrics: Metrics) -> Table | None:
     """Seconds by stage, the longest first; None where nothing was timed."""
-    stages = known(metrics.timing.stages)
+    stages = metrics.timing.stages
     if not stages:
         return None
     timed = sum(stages.values())
-    total = max(known(metrics.timing.seconds_total) or 0.0, timed, 1e-9)
+    total = max(metrics.timing.seconds_total or 0.0, timed, 1e-9)
     stages = stages | {"between stages": total - timed}
     longest = max(*stages.values(), 1e-9)
     rows = [
         [Cell(name), Cell(f"{seconds:.1f} s"), Cell(f"{100 * seconds / total:.0f} %"), _bar(seconds / longest)]
         for name, seconds in sorted(stages.items(), key=lambda item: -item[1])
     ]
-    memory, processor = (number(each).text for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds))
+    memory, processor = (number(metrics.timing, name).text for name in ("peak_rss_mb", "cpu_seconds"))
     words = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."
     return Table(("stage", "time", "share", ""), rows, notes=[words])
 
@@ -259,12 +260,12 @@ def _missing_errors(metrics: Metrics) -> list[str]:
     missing: dict[str, list[str]] = {}
     for column in COLUMNS:
         for name, errors in metrics.evaluated_errors().items():
-            value = column.value(errors)
-            if isinstance(value, Missing):
-                missing.setdefault(value.reason, []).append(f"{column.name} of {name}")
+            value, reason = errors.at(column.path)
+            if value is None:
+                missing.setdefault(reason, []).append(f"{column.name} of {name}")
     for name, errors in metrics.all_errors().items():
-        if isinstance(errors, Missing):
-            missing.setdefault(errors.reason, []).append(f"{name} trajectory")
+        if errors.absent:
+            missing.setdefault(errors.absent, []).append(f"{name} trajectory")
     return [f"{', '.join(what) if len(what) <= 4 else 'others'}: {why}" for why, what in missing.items()]
 
 
@@ -290,15 +291,15 @@ def notes_on(reasons: Iterable[str]) -> list[str]:
 
 def _depth_source(metrics: Metrics) -> str:
     name = metrics.provenance.depth_source
-    if isinstance(name, Missing):
-        return f"{DASH} ({name.reason})"
-    sha256 = known(metrics.provenance.depth_sha256)
+    if name is None:
+        return f"{DASH} ({metrics.provenance.why('depth_source')})"
+    sha256 = metrics.provenance.depth_sha256
     return "by these weights" if name == "network" else f"{name}, sha256 {str(sha256)[:16]}"
 
 
-def _stretches(found: list[Stretch] | Missing) -> str:
+def _stretches(found: list[Stretch] | None) -> str:
     """Consecutive frames, with the reason of the first."""
-    return _shortened([f"{each.first} to {each.last}: {each.reason}" for each in found])
+    return _shortened([f"{each.first} to {each.last}: {each.reason}" for each in found or ()])
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> str:

@@ -14,7 +14,6 @@ from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.terminal_tables import comparison_table, metrics_table
-from slam.runtime.storage.record import Missing
 
 MakeRun = Callable[..., RunFolder]
 MakeMetrics = Callable[..., dict[str, Any]]
@@ -95,7 +94,9 @@ def test_rows_columns_and_title() -> None:
 
 
 def test_missing_numbers_are_dashes_with_one_reason_each() -> None:
-    text = shown({"network": errors_of(50), "odometry": errors_of(50), "lidar": Missing()}, "x")
+    text = shown(
+        {"network": errors_of(50), "odometry": errors_of(50), "lidar": TrajectoryMetrics(absent="not recorded")}, "x"
+    )
     assert text.count("no segment of 100 m fits") == 1
     assert "– network, odometry: no segment" in text
     assert "– lidar: not recorded." in text

@@ -68,7 +68,8 @@ class _Lines:
         if done <= 0 or spent_s <= 0 or self._done >= self._total:
             return f"{text} after {spent_s:.0f} s"
         left_s = round((self._total - self._done) * spent_s / done)
-        return f"{text}, {done / spent_s:.2g} a second, {left_s // 60} min {left_s % 60} s left"
+        days, minutes = left_s / 86400, f"{left_s // 60} min {left_s % 60} s"
+        return f"{text}, {done / spent_s:.2g} a second, {f'{days:.1f} days' if days > 2 else minutes} left"
 
 
 @contextmanager

@@ -24,8 +24,14 @@ class RunFolder:
     """The files of one run, under the names of the contract (``docs/run-folder.md``)."""
 
     def __init__(self, path: str | Path) -> None:
-        """A folder that exists, such as ``results/latest``."""
+        """A folder that exists, such as ``results/latest``.
+
+        Raises:
+            RunError: it is not there.
+        """
         self.path = Path(path)
+        if not self.path.is_dir():
+            raise RunError(f"{path} is not there: give a folder that 'erfsfm-slam run' wrote")
 
     @classmethod
     def create(cls, output: Path | None, results: Path, sequence: str, lock: FolderLock | None = None) -> RunFolder:

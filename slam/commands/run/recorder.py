@@ -22,7 +22,7 @@ from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors
-from slam.results.metrics import MapMetrics, Metrics, Provenance
+from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
 from slam.results.report.page import write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
@@ -120,7 +120,7 @@ class FolderRecorder(Recorder):
 
     def no_map(self, reason: str) -> None:
         """The reason is its metric."""
-        self._metrics = self._metrics.changed(map=MapMetrics.unknown(reason))
+        self._metrics = self._metrics.changed(map=MapMetrics.unknown(reason, *SIZES, *MAP_ERRORS))
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""

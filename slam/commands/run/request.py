@@ -69,9 +69,10 @@ class RunRequest:
 
         from erfsfm.common.config_tree import first_problem
 
-        unknown = arguments.keys() - {field.name for field in fields(cls)}
+        names = [field.name for field in fields(cls)]
+        unknown = arguments.keys() - set(names)
         if unknown:
-            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
+            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}: it has {', '.join(names)}")
         arguments |= {key: str(arguments[key]) for key in _TEXTS if isinstance(arguments.get(key), Path)}
         try:
             request = TypeAdapter(cls).validate_python(arguments)

@@ -19,6 +19,11 @@ from slam.runtime.errors import RunError
 MakeRun = Callable[..., RunFolder]
 
 
+def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="nowhere is not there"):
+        RunFolder(tmp_path / "nowhere")
+
+
 def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path: Path) -> None:
     first = RunFolder.create(None, tmp_path / "results", "sim/loop 42")
     second = RunFolder.create(None, tmp_path / "results", "sim/loop 42")

@@ -18,7 +18,6 @@ from slam.config.frontend import (
     GapsConfig,
     GpsConfig,
     KeyframesConfig,
-    LengthConfig,
     LidarConfig,
     RoadConfig,
     ScaleConfig,
@@ -32,12 +31,10 @@ __all__ = [
     "GapsConfig",
     "GpsConfig",
     "KeyframesConfig",
-    "LengthConfig",
     "LidarConfig",
     "LoopsConfig",
     "MappingConfig",
     "OutputConfig",
-    "PoseGraphConfig",
     "RoadConfig",
     "ScaleConfig",
     "ScaleMode",
@@ -138,14 +135,6 @@ class LoopsConfig(Section):
     min_support: int = Field(default=2, ge=0, description="least number of images whose loops support a loop")
 
 
-class PoseGraphConfig(Section):
-    """The pose graph, see ``graph/pose_graph.py``."""
-
-    kernel: Literal["none", "huber"] = Field(default="huber", description="robust loss")
-    huber_k: float = Field(default=1.345, gt=0, description="whitened residual at which Huber becomes linear")
-    max_loop_residual: float = Field(default=8.0, gt=0, description="whitened residual beyond which a loop is removed")
-
-
 class MappingConfig(Section):
     """The map, see ``docs/design/map.md``. Without metres, all lengths here follow the depth of the scene."""
 
@@ -242,12 +231,10 @@ class SlamConfig(Section):
     keyframes: KeyframesConfig = KeyframesConfig()
     gaps: GapsConfig = GapsConfig()
     road: RoadConfig = RoadConfig()
-    lengths: LengthConfig = LengthConfig()
     lidar: LidarConfig = LidarConfig()
     gps: GpsConfig = GpsConfig()
     scale: ScaleConfig = ScaleConfig()
     loops: LoopsConfig = LoopsConfig()
-    pose_graph: PoseGraphConfig = PoseGraphConfig()
     mapping: MappingConfig = MappingConfig()
     output: OutputConfig = OutputConfig()
 

@@ -142,7 +142,7 @@ class LivePoses:
         # keyframes know all lengths but their unit, which learned depth of the ground gives
         roads_alone = replace(window, motions=[], road_steps={})
         window = roads_alone if by_keyframes else complete_drive(window, self._sources)
-        scale = find_scale(self._mode, self._camera_height_m, window, [], self._config.lengths)
+        scale = find_scale(self._mode, self._camera_height_m, window, [])
         self.unit_name = scale.unit_name
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
         if self._unit is None:

@@ -73,26 +73,26 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
         import_extra("rerun")
     settings = load_config(request.config, request.overrides or ())
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
-    source = open_source(request.source, request.wait)
-    camera = calibration_of(request.source, request.camera_file, source)
+    source = open_source(request.dataset, request.wait)
+    camera = calibration_of(request.dataset, request.camera, source)
     source.fps = camera.fps
     intrinsics = intrinsics_of(camera)
     depth = open_depth(settings.depth, intrinsics, None)
     predictor = make_predictor(networks, depth, settings.depth, intrinsics)
-    name = Path(request.source).stem or "live"
+    name = Path(request.dataset).stem or "live"
     growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
     require_possible(growing, settings, predictor.sources + 1)
     blank = np.zeros((intrinsics.height, intrinsics.width, 3), np.uint8)
     networks.depth(blank)  # both are loaded before images come
     networks.poses([blank] * (networks.sources + 1))
     sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
-    sequence.intrinsics = as_known(sequence.intrinsics, request.camera_file)
+    sequence.intrinsics = as_known(sequence.intrinsics, request.camera)
     pipeline = SlamPipeline(sequence, predictor, settings, seed=request.seed)
     poses = LivePoses(predictor.sources, sequence.camera_height_m, settings)
     session = _Session(sequence, poses, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
-        dataset=Path(request.source),
-        camera=request.camera_file,
+        dataset=Path(request.dataset),
+        camera=request.camera,
         weights=request.weights,
         output=request.output,
         seed=request.seed,

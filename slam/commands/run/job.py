@@ -29,9 +29,8 @@ from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
-from slam.results.report.page import write_report
+from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
-from slam.results.report.rendering import Picture
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
 from slam.runtime.attempt import attempt

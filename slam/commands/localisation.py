@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,9 @@ from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.common.readers.folder import image_folder
 from erfsfm.common.readers.images import list_images, read_image
 from erfsfm.common.readers.numbering import in_order
+from erfsfm.common.table import DASH, Table
 from slam.config.sections import LoopsConfig, load_stored
+from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.frontend.keyframes.camera_pose import CameraPose, resect
 from slam.geometry.resection import consensus
@@ -56,6 +59,16 @@ class Localisation:
     nearest_frame: int | None = None
     inliers: int = 0
     reason: str = ""
+
+    def tree(self) -> dict[str, Any]:
+        """For JSON: unknown values are null, with the reason."""
+        T_world_camera = self.T_world_camera
+        entry = {"image": self.image, "found": T_world_camera is not None}
+        if T_world_camera is None:
+            values: dict[str, Any] = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
+            return entry | values | {"reason": self.reason}
+        pose = {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
+        return entry | pose | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
 
 
 def image_numbers(images: Path, frames: str | None = None, every: int = 1) -> range:
@@ -104,18 +117,42 @@ def localise(
     for path in chosen:
         try:
             image = read_image(path)
-        except DataError as error:
-            unreadable += 1
+            yield localiser.locate(path.name, image if undistortion is None else undistortion.apply(image))
+        except (DataError, SequenceError) as error:
+            unreadable += isinstance(error, DataError)
             if unreadable == len(chosen):
                 raise  # not one of them is an image
             yield Localisation(path.name, reason=str(error))
-            continue
-        try:
-            if undistortion is not None:
-                image = undistortion.apply(image)
-            yield localiser.locate(path.name, image)
-        except SequenceError as error:
-            yield Localisation(path.name, reason=str(error))
+
+
+def localisation_table(found: Sequence[Localisation]) -> Table:
+    """One row an image: position in the map, nearest frame of the run, inliers; below, why one is not found."""
+    rows = []
+    for each in found:
+        row = [each.image, *[DASH] * 5]
+        if each.T_world_camera is not None:
+            position = (f"{value:.2f}" for value in each.T_world_camera[:3, 3])
+            row[1:] = [*position, str(each.nearest_frame), str(each.inliers)]
+        rows.append(row)
+    notes = [f"{each.image} not found: {each.reason}" for each in found if each.T_world_camera is None]
+    head = ["image", "x", "y", "z", "nearest\nframe", "inliers"]
+    return Table(head, rows, f"{len(found) - len(notes)} of {len(found)} images found", notes)
+
+
+def write_localisations(path: Path, found: Sequence[Localisation], numbers: Sequence[int] | None = None) -> None:
+    """Write the poses found: as TUM, or after the number of their frame as KITTI where the name ends in ``.kitti``.
+
+    The stamp, or number, is that of the image, by default its place in the list.
+
+    Raises:
+        RunError: no image was found.
+    """
+    stamps = range(len(found)) if numbers is None else numbers
+    poses = {k: each.T_world_camera for k, each in zip(stamps, found, strict=True) if each.T_world_camera is not None}
+    if not poses:
+        raise RunError(f"none of {len(found)} images was found in the map: {path} is not written")
+    write = write_kitti if path.suffix == ".kitti" else write_tum
+    write(path, Trajectory(np.array(list(poses), dtype=np.float64), np.stack(list(poses.values())), numbered=True))
 
 
 class Localiser:

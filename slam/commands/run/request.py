@@ -59,7 +59,8 @@ class RunRequest:
 
         unknown = arguments.keys() - {field.name for field in fields(cls)}
         if unknown:
-            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
+            names = ", ".join(field.name for field in fields(cls) if field.name != "command")
+            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}; it has {names}")
         arguments |= {key: str(arguments[key]) for key in _TEXTS if isinstance(arguments.get(key), Path)}
         try:
             request = TypeAdapter(cls).validate_python(arguments)

@@ -436,6 +436,7 @@ def doctor(
 
 def _print_run(folder: RunFolder) -> None:
     """The errors of a run, what raises doubt, and where everything is."""
+    from slam.results.report.tables import by_reason
     from slam.results.report.verdict import verdict
     from slam.results.tables import errors_table, written
     from slam.runtime.run_files import REPORT
@@ -454,8 +455,8 @@ def _print_run(folder: RunFolder) -> None:
         typer.echo(f"doubts: {'; '.join(found.doubts)}")
     for note in metrics.unit_notes():
         typer.echo(note)
-    for gap in sequence.bridged:
-        typer.echo(f"INTERPOLATED: frames {gap.first} to {gap.last}: {gap.reason}")
+    for line in by_reason(sequence.bridged):
+        typer.echo(f"INTERPOLATED: {line}")
     depth = "" if provenance.depth_source == "network" else f"; depth {known(provenance.depth_source)}"
     typer.echo(f"weights {known(provenance.weights)}: {known(provenance.weights_licence)}{depth}")
     seconds, per_second = written(timing.seconds_total, 1), written(timing.frames_per_second, 1)

@@ -21,7 +21,7 @@ from erfsfm.common.table import DASH, Table
 from slam.config.sections import LoopsConfig, load_stored
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.frontend.keyframes.camera_pose import CameraPose, resect
+from slam.frontend.keyframes.camera_pose import resect
 from slam.geometry.resection import consensus
 from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_matrix
 from slam.loops.descriptors import FeatureExtractor, hamming
@@ -187,14 +187,13 @@ class Localiser:
         if not rows:
             return Localisation(name, reason="no place of the map is similar")
         learned = self._structure.confirms_depth(rows)
-        found = self._found(rows, view, learned)
-        if isinstance(found, str):
-            found = self._found(rows, view, not learned)
-        if isinstance(found, str):
-            return Localisation(name, reason=f"{len(rows)} similar places; {found}")
+        found = self._found(name, rows, view, learned)
+        if found.T_world_camera is None:
+            found = self._found(name, rows, view, not learned)
+        if found.T_world_camera is None:
+            return replace(found, reason=f"{len(rows)} similar places; {found.reason}")
         away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
-        nearest = self._places.views[int(away.argmin())].index
-        return Localisation(name, found.T_world_camera, nearest, found.inliers)
+        return replace(found, nearest_frame=self._places.views[int(away.argmin())].index)
 
     def _view(self, image: Image) -> View:
         camera = self._intrinsics
@@ -209,29 +208,41 @@ class Localiser:
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
-    def _found(self, rows: list[int], view: View, learned: bool) -> _Pose | str:
+    def _found(self, name: str, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
         starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
         starts.sort(key=lambda start: len(start[2]), reverse=True)
-        found = [self._refined(start, rows, view, learned) for start in starts[:_STARTS]]
-        if not found:
-            return "no place has corners that fit one pose"
-        poses = [each for each in found if isinstance(each, _Pose)]
-        return max(poses, key=lambda pose: pose.inliers) if poses else found[0]
+        found = [self._refined(name, start, rows, view, learned) for start in starts[:_STARTS]]
+        nowhere = Localisation(name, reason="no place has corners that fit one pose")
+        return max(found, key=lambda each: each.inliers, default=nowhere)
 
     def _refined(
-        self, start: tuple[FloatArray, FloatArray, NDArray[np.intp]], rows: list[int], view: View, learned: bool
-    ) -> _Pose | str:
+        self,
+        name: str,
+        start: tuple[FloatArray, FloatArray, NDArray[np.intp]],
+        rows: list[int],
+        view: View,
+        learned: bool,
+    ) -> Localisation:
         """The pose by all corners of the map around a first one; or why it is none."""
         T_camera_world = make(rotation_matrix(start[0]), start[1])
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
             if len(points) < self._thresholds.min_inliers:
-                return f"only {len(points)} corners agree"
+                return Localisation(name, reason=f"only {len(points)} corners agree")
             pose = resect([T_camera_world], points, pixels, self._intrinsics)
             T_camera_world = pose.T_camera_world
-        return self._accepted(pose, points)
+        inliers = pose.residual_px < self._thresholds.reprojection_px
+        count = int(inliers.sum())
+        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
+            return Localisation(name, reason=f"only {count} of {len(inliers)} corners agree")
+        depth = float(np.median(apply(T_camera_world, points[inliers])[:, 2]))
+        sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
+        if sigma > _MOST_SIGMA:
+            reason = f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
+            return Localisation(name, reason=reason)
+        return Localisation(name, invert(T_camera_world), inliers=count)
 
     def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, FloatArray, NDArray[np.intp]] | None:
         """The pose by one place, as `consensus` gives it."""
@@ -262,26 +273,6 @@ class Localiser:
         best = differing.argmin(axis=1)
         corners = np.flatnonzero(differing[np.arange(len(view)), best] <= _MOST_DIFFERING)
         return points[best[corners]], view.pixels[corners].astype(np.float64)
-
-    def _accepted(self, pose: CameraPose, points: FloatArray) -> _Pose | str:
-        """The pose, if enough corners agree and determine it."""
-        inliers = pose.residual_px < self._thresholds.reprojection_px
-        count = int(inliers.sum())
-        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
-            return f"only {count} of {len(inliers)} corners agree"
-        depth = float(np.median(apply(pose.T_camera_world, points[inliers])[:, 2]))
-        sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
-        if sigma > _MOST_SIGMA:
-            return f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
-        return _Pose(invert(pose.T_camera_world), count)
-
-
-@dataclass(frozen=True)
-class _Pose:
-    """The pose of the image and its number of inliers."""
-
-    T_world_camera: FloatArray
-    inliers: int
 
 
 def image_paths(images: Path) -> list[Path]:

@@ -30,7 +30,7 @@ R_UP_WORLDS: dict[str, FloatArray] = {
     "y-down": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # x right, y ahead, z up
 }
-_OPTIONS = {
+_OPTIONS: dict[str, tuple[str, ...]] = {
     "mesh": (),
     "cloud": (),
     "colmap": ("dataset", "points"),

@@ -179,7 +179,7 @@ def map_errors(metrics: Metrics) -> Table | None:
         return None
     if isinstance(found.truth, Missing):
         return Table((), (), notes=[f"No error of the map: {found.truth.reason}."])
-    rows = {"one rigid motion": found} if metrics.is_metric else {}
+    rows: dict[str, SurfaceMetrics | Missing] = {"one rigid motion": found} if metrics.is_metric else {}
     if not isinstance(found.in_field.share, Missing) and found.in_field.share != 1.0:
         rows["where the scanner looked"] = found.in_field
     rows["with one scale"] = found.with_scale

@@ -37,7 +37,6 @@ from slam.formats.trajectory import Trajectory, associate, read_trajectory
 from slam.results.folder import RunFolder
 from slam.results.tables import written
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import known
 from slam.sequences.catalogue import open_sequence
 
 WITH_MAP = Configuration("map", QUIET)
@@ -199,7 +198,7 @@ def _ate(estimate: Trajectory | None, reference: Trajectory | None, among: Traje
         return DASH
     if among is not None:
         estimate, _ = associate(estimate, among)
-    return written(known(trajectory_metrics(*associate(estimate, reference)).align.dof7.ate_rmse_m), 3)
+    return written(trajectory_metrics(*associate(estimate, reference)).align.dof7.ate_rmse_m, 3)
 
 
 def _ours(pair: Pair, name: str = "optimised") -> Trajectory | None:
@@ -216,11 +215,11 @@ def _metric(pair: Pair) -> str:
     result = pair.without_map
     if result.reason or not result.metrics.is_metric:
         return DASH
-    return written(known(result.metrics.trajectories.optimised.align.dof6.ate_rmse_m), 3)
+    return written(result.metrics.trajectories.optimised.align.dof6.ate_rmse_m, 3)
 
 
 def _peer_cpu(pair: Pair) -> str:
-    frames = known(pair.without_map.metrics.sequence.frames)
+    frames = pair.without_map.metrics.sequence.frames
     seconds = pair.peer.record.get("cpu_s")
     return f"{1e3 * seconds / frames:.1f}" if seconds and frames else DASH
 

@@ -28,7 +28,6 @@ from erfsfm.common.table import Table
 from slam.frontend.agreement import CONFIDENCE, share_right
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
-from slam.runtime.storage.record import known
 
 RIGHT = 0.01  # of the path
 FOCAL = "focal"  # in the names of runs with a wrong focal length
@@ -53,9 +52,9 @@ def outcomes(runs: Path) -> Iterator[Outcome]:
     """Of the run folders in a folder that have a truth and metres."""
     for path in sorted(runs.iterdir()):
         metrics = RunFolder(path).metrics()
-        ate_m, length_m = known(metrics.trajectories.optimised.align.dof6.ate_rmse_m), known(metrics.sequence.length_m)
-        if ate_m is not None and length_m and metrics.is_metric and not known(metrics.tracking):
-            sigmas = max(known(each.sigmas) or 0.0 for each in known(metrics.agreement) or ())
+        ate_m, length_m = metrics.trajectories.optimised.align.dof6.ate_rmse_m, metrics.sequence.length_m
+        if ate_m is not None and length_m and metrics.is_metric and metrics.tracking.absent:
+            sigmas = max(each.sigmas or 0.0 for each in metrics.agreement or ())
             yield Outcome(path.name, sigmas, ate_m / length_m)
 
 

@@ -26,7 +26,6 @@ from slam.results.metrics import Metrics
 from slam.results.tables import written
 from slam.runtime.errors import RunError, SequenceError, SlamError
 from slam.runtime.storage.files import from_anywhere, write_atomically
-from slam.runtime.storage.record import Missing, known
 from slam.sequences.catalogue import sequence_names
 from slam.sequences.excerpt import frame_range
 
@@ -43,7 +42,7 @@ _COLUMNS: dict[str, tuple[Callable[[Metrics], object], int | None]] = {
     "length_m": (lambda m: m.sequence.length_m, 0),
     "scale": (lambda m: m.scale.mode, None),
     "unit": (lambda m: m.unit, 0),
-    "ate_6dof_m": (lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else Missing(), 3),
+    "ate_6dof_m": (lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else None, 3),
     "ate_7dof_m": (lambda m: m.trajectories.optimised.align.dof7.ate_rmse_m, 3),
     "t_rel_percent": (lambda m: m.trajectories.optimised.align.dof7.t_rel_percent, 2),
     "r_rel_deg_per_100m": (lambda m: m.trajectories.optimised.align.dof7.r_rel_deg_per_100m, None),
@@ -313,4 +312,4 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     if outcome.status == "failed":
         return row | dict.fromkeys(_COLUMNS)
     metrics = RunFolder(outcome.folder).metrics()
-    return row | {name: known(value(metrics)) for name, (value, _) in _COLUMNS.items()}
+    return row | {name: value(metrics) for name, (value, _) in _COLUMNS.items()}

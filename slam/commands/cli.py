@@ -113,9 +113,8 @@ def live(
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.messages import write_line
     from slam.commands.live.request import LiveRequest
-    from slam.commands.live.run import run_live
+    from slam.commands.live.run import run_live, write_line
 
     request = LiveRequest(
         dataset=dataset,
@@ -440,29 +439,28 @@ def _print_run(folder: RunFolder) -> None:
     from slam.results.report.verdict import verdict
     from slam.results.tables import errors_table, written
     from slam.runtime.run_files import REPORT
-    from slam.runtime.storage.record import Missing, known
 
     metrics = folder.metrics()
     sequence, provenance, timing = metrics.sequence, metrics.provenance, metrics.timing
-    title = f"{known(sequence.name)}, scale {known(metrics.scale.mode)}"
-    if isinstance(sequence.length_m, Missing):
-        typer.echo(f"{title}: no errors, for {sequence.length_m.reason}")
+    title = f"{sequence.name}, scale {metrics.scale.mode}"
+    if sequence.length_m is None:
+        typer.echo(f"{title}: no errors, for {sequence.why('length_m')}")
     else:
         errors_table(metrics.evaluated_errors(), title).print()
-    if (sure := known(metrics.confidence.run)) is not None:
+    if (sure := metrics.confidence.run) is not None:
         typer.echo(f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path")
     if (found := verdict(metrics)) is not None and found.doubts:
         typer.echo(f"doubts: {'; '.join(found.doubts)}")
     for note in metrics.unit_notes():
         typer.echo(note)
-    for line in by_reason(sequence.bridged):
+    for line in by_reason(sequence.bridged or ()):
         typer.echo(f"INTERPOLATED: {line}")
-    depth = "" if provenance.depth_source == "network" else f"; depth {known(provenance.depth_source)}"
-    typer.echo(f"weights {known(provenance.weights)}: {known(provenance.weights_licence)}{depth}")
+    depth = "" if provenance.depth_source == "network" else f"; depth {provenance.depth_source}"
+    typer.echo(f"weights {provenance.weights}: {provenance.weights_licence}{depth}")
     seconds, per_second = written(timing.seconds_total, 1), written(timing.frames_per_second, 1)
     report = folder.path / REPORT
     typer.echo(
-        f"{known(sequence.frames) or 0} frames in {seconds} s ({per_second} a second); everything in {folder.path}"
+        f"{sequence.frames or 0} frames in {seconds} s ({per_second} a second); everything in {folder.path}"
         + (f", read {report}" if report.is_file() else "")
     )
 

@@ -23,7 +23,6 @@ from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.results.output_file import check_replaced
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
-from slam.runtime.storage.record import known
 
 # from a camera's x right, y down, z ahead
 R_UP_WORLDS: dict[str, FloatArray] = {
@@ -158,7 +157,7 @@ def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     trajectory = folder.trajectory("optimised")
     if trajectory is None:
         raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
-    frames = known(folder.metrics().sequence.frames)
+    frames = folder.metrics().sequence.frames
     if frames is not None and frames != len(trajectory):
         raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
     return replace(trajectory, T_world_camera=se3.make(R_UP_WORLDS[up], np.zeros(3)) @ trajectory.T_world_camera)

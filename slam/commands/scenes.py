@@ -25,7 +25,6 @@ from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import PLACES
 from slam.runtime.storage.files import remove, write_atomically
-from slam.runtime.storage.record import Missing, known
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 
@@ -66,7 +65,7 @@ def write_model(
     """
     places = Places.read(folder.require(PLACES))
     without = _interpolated(folder)
-    if dataset is None and isinstance(folder.metrics().provenance.recording, Missing):
+    if dataset is None and folder.metrics().provenance.recording.absent:
         logger.warning("%s does not record where its images are: the model has none; give --dataset", folder.path)
     else:
         without = set(range(len(trajectory))) - set(_write_images(folder, output, trajectory, dataset, progress)[1])
@@ -157,15 +156,14 @@ def _image_name(frame: int) -> str:
 def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:
     """The recording of a run, and which frame of it, by its stamp, each row of the trajectory is."""
     recorded = folder.metrics().provenance.recording
-    if isinstance(recorded, Missing) and dataset is None:
+    if recorded.absent and dataset is None:
         raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
-    dataset_text, camera_text = known(recorded.dataset), known(recorded.camera)
-    place = dataset or (None if dataset_text is None else Path(dataset_text))
-    camera = None if camera_text is None else Path(camera_text)
+    place = dataset or (None if recorded.dataset is None else Path(recorded.dataset))
+    camera = None if recorded.camera is None else Path(recorded.camera)
     if dataset is not None and camera is not None and not (camera.exists() or is_field_of_view(camera)):
         camera = None  # it may have moved with the images
     try:
-        sequence = open_sequence(place, known(recorded.sequence), camera)
+        sequence = open_sequence(place, recorded.sequence, camera)
     except (SlamError, ErfsfmError) as error:
         raise RunError(
             f"the images of {folder.path} are needed and not found ({error}); give --dataset ROOT"
@@ -184,4 +182,4 @@ def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) 
 
 def _interpolated(folder: RunFolder) -> set[int]:
     """Frames of a run without a usable image."""
-    return {k for gap in folder.metrics().sequence.bridged for k in range(gap.first, gap.last + 1)}
+    return {k for gap in folder.metrics().sequence.bridged or () for k in range(gap.first, gap.last + 1)}

@@ -15,7 +15,7 @@ from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, trajectory_file
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import MISSING, Missing
+from slam.runtime.storage.record import NOT_RECORDED
 
 logger = logging.getLogger(__name__)
 
@@ -135,7 +135,5 @@ class RunFolder:
 
     def _without_map(self) -> str:
         metrics = self.metrics()
-        triangles = metrics.map.triangles
-        if triangles == MISSING:
-            return metrics.failure or "it ran without a map"
-        return triangles.reason if isinstance(triangles, Missing) else "it ran without a map"
+        why = metrics.map.why("triangles")
+        return (metrics.failure or "it ran without a map") if why == NOT_RECORDED else why

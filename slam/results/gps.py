@@ -11,24 +11,24 @@ from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.results.metrics import GpsErrors, GpsMetrics, Origin
-from slam.runtime.storage.record import Missing
+from slam.runtime.attempt import Failed
 
 
-def gps_metrics(result: Estimate, in_graph: bool) -> GpsMetrics | Missing:
+def gps_metrics(result: Estimate, in_graph: bool) -> GpsMetrics | Failed:
     """Distances of odometry and optimised trajectory from the fixes, and the place of the first camera."""
     location = result.location
     if not isinstance(location, Location):
-        return Missing("no GPS track was given" if location is None else location.reason)
+        return location or Failed("no GPS track was given")
     T_enu_first = location.T_enu_world @ result.optimised.T_world_camera[0]
     latitude, longitude, height = location.fixes.frame.places(T_enu_first[None, :3, 3])[0].tolist()
     ahead = T_enu_first[:3, 2]
     heading = float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0)
     aligned = gps.align(location.fixes, result.odometry.T_world_camera, result.odometry.stamps)
-    return GpsMetrics(
+    return GpsMetrics.of(
         fixes=len(location.fixes.stamps),
         in_graph=in_graph,
         origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
-        odometry=Missing(aligned.reason)
+        odometry=aligned
         if isinstance(aligned, MeasurementFailure)
         else _errors(location.fixes, aligned, result.odometry),
         optimised=_errors(location.fixes, location.T_enu_world, result.optimised),

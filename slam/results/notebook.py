@@ -7,13 +7,12 @@ from html import escape
 from slam.results.folder import RunFolder
 from slam.results.tables import errors_table
 from slam.runtime.run_files import REPORT
-from slam.runtime.storage.record import known
 
 
 def html(run: RunFolder) -> str:
     """The run as a piece of HTML without scripts."""
     metrics = run.metrics()
-    title = f"{known(metrics.sequence.name) or run.path.name}: {known(metrics.sequence.frames) or 0} frames"
+    title = f"{metrics.sequence.name or run.path.name}: {metrics.sequence.frames or 0} frames"
     errors = metrics.evaluated_errors()
     notes = [note for note in (metrics.failure, *metrics.unit_notes()) if note]
     if (run.path / REPORT).is_file():

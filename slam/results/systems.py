@@ -20,7 +20,6 @@ from slam.results.tables import COLUMNS, UNITS, ErrorColumn, missing_notes, writ
 from slam.runtime.errors import RunError, TrajectoryError
 from slam.runtime.run_files import REFERENCE
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import Missing
 from slam.sequences.excerpt import frame_range
 
 logger = logging.getLogger(__name__)
@@ -136,7 +135,7 @@ def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
 
 def _spread(column: ErrorColumn, runs: Sequence[SystemRun]) -> str:
     """The number of one run; of several the mean and the deviation of those that have it."""
-    values = [value for value in (column.value(run.errors) for run in runs) if not isinstance(value, Missing)]
+    values = [value for value in (run.errors.at(column.path)[0] for run in runs) if value is not None]
     if len(values) < 2:
         return written(values[0] if values else None, column.decimals)
     mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))

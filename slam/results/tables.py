@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from erfsfm.common.table import DASH, Table
-from slam.evaluation.trajectory import TrajectoryMetrics
+from slam.evaluation.trajectory import ALIGNMENTS, TrajectoryMetrics
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
-from slam.runtime.storage.record import Missing, known
 
-Errors = TrajectoryMetrics | Missing
 UNITS = "ATE: RMSE, m; of snippets of five frames, each with its own scale, norm / 5. RE: rad. t_rel, r_rel: 7 dof."
 _LEAK = "LEAK: the weights were trained on the sequence; the numbers are no test."
-_ALIGNMENTS = {"dof6": "6dof", "dof7": "7dof"}
 _OF_ALIGNMENT = {
     "ATE\nm": ("ate_rmse_m", 3),
     "t_rel\n%": ("t_rel_percent", 2),
@@ -27,26 +24,26 @@ _OF_ALIGNMENT = {
 
 
 class ErrorColumn(NamedTuple):
-    """One number of a trajectory in the tables: its header, its value and its decimals."""
+    """One number of a trajectory in the tables: its header, its path in the record and its decimals."""
 
     name: str
-    value: Callable[[Errors], float | Missing]
+    path: str
     decimals: int
 
 
 COLUMNS = (
-    ErrorColumn("snippet\nATE", lambda e: e.snippet5.ate_mean, 4),
-    ErrorColumn("snippet\nRE", lambda e: e.snippet5.re_mean, 4),
-    ErrorColumn("ATE\n7dof", lambda e: e.align.dof7.ate_rmse_m, 3),
-    ErrorColumn("ATE\n6dof", lambda e: e.align.dof6.ate_rmse_m, 3),
-    ErrorColumn("t_rel\n%", lambda e: e.align.dof7.t_rel_percent, 2),
-    ErrorColumn("r_rel\ndeg/100m", lambda e: e.align.dof7.r_rel_deg_per_100m, 3),
+    ErrorColumn("snippet\nATE", "snippet5.ate_mean", 4),
+    ErrorColumn("snippet\nRE", "snippet5.re_mean", 4),
+    ErrorColumn("ATE\n7dof", "align.7dof.ate_rmse_m", 3),
+    ErrorColumn("ATE\n6dof", "align.6dof.ate_rmse_m", 3),
+    ErrorColumn("t_rel\n%", "align.7dof.t_rel_percent", 2),
+    ErrorColumn("r_rel\ndeg/100m", "align.7dof.r_rel_deg_per_100m", 3),
 )
 
 
 def written(value: Any, decimals: int) -> str:
     """A number with its decimals, tiny ones in powers of ten; a dash for a missing one."""
-    if value is None or isinstance(value, Missing):
+    if value is None:
         return DASH
     if not isinstance(value, float):
         return str(value)
@@ -54,10 +51,10 @@ def written(value: Any, decimals: int) -> str:
     return f"{value:.1e}" if tiny else f"{value:.{decimals}f}"
 
 
-def errors_table(trajectories: Mapping[str, Errors], title: str = "") -> Table:
+def errors_table(trajectories: Mapping[str, TrajectoryMetrics], title: str = "") -> Table:
     """The main errors, a row for each trajectory; below, the reasons of missing numbers, and whether evo agrees."""
     rows = [[name, *_numbers(errors)] for name, errors in trajectories.items()]
-    found = [off for errors in trajectories.values() if (off := known(errors.evo.difference)) is not None]
+    found = [off for errors in trajectories.values() if (off := errors.evo.difference) is not None]
     evo = [f"evo gives the same numbers, to {max(found):.0e}."] if found else []
     notes = [UNITS, *evo, *missing_notes(trajectories)]
     return Table(["trajectory", *(column.name for column in COLUMNS)], rows, title, notes)
@@ -65,19 +62,10 @@ def errors_table(trajectories: Mapping[str, Errors], title: str = "") -> Table:
 
 def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
     """Every statistic of one trajectory under every alignment, and its snippets below."""
-    rows = [
-        [
-            _ALIGNMENTS.get(how, how),
-            *(written(getattr(each, key), decimals) for key, decimals in _OF_ALIGNMENT.values()),
-        ]
-        for how, each in errors.align
-    ]
-    missing = {
-        value.reason: None
-        for _, each in errors.align
-        for key, _ in _OF_ALIGNMENT.values()
-        if isinstance(value := getattr(each, key), Missing)
-    }
+    values = {how: [errors.at(f"align.{how}.{key}") for key, _ in _OF_ALIGNMENT.values()] for how in ALIGNMENTS}
+    decimals = [decimals for _, decimals in _OF_ALIGNMENT.values()]
+    rows = [[how, *(written(value, k) for (value, _), k in zip(row, decimals))] for how, row in values.items()]
+    missing = {reason: None for row in values.values() for value, reason in row if value is None}
     snippets, evo = errors.snippet5, errors.evo
     notes = [
         f"Snippets of five frames: ATE {written(snippets.ate_mean, 4)} ± {written(snippets.ate_std, 4)} m, RE "
@@ -128,30 +116,30 @@ def runs_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
         entry: dict[str, Any] = {"run": str(run.path), "status": metrics.status}
         if metrics.failure:
             entry["reason"] = metrics.failure
-        entry["leak"] = known(metrics.provenance.leak)
+        entry["leak"] = metrics.provenance.leak
         objects.append(entry | {key: tree.get(key) for key in ("sequence", "scale", "trajectories")})
     return objects
 
 
-def missing_notes(trajectories: Mapping[str, Errors]) -> list[str]:
+def missing_notes(trajectories: Mapping[str, TrajectoryMetrics]) -> list[str]:
     """A line for each reason why numbers are missing, with the trajectories that lack them."""
     names: dict[str, dict[str, None]] = {}
     for name, errors in trajectories.items():
-        for value in (column.value(errors) for column in COLUMNS):
-            if isinstance(value, Missing):
-                names.setdefault(value.reason, {})[name] = None
+        for value, reason in (errors.at(column.path) for column in COLUMNS):
+            if value is None:
+                names.setdefault(reason, {})[name] = None
     return [f"{DASH} {', '.join(without)}: {reason}." for reason, without in names.items()]
 
 
-def missing_errors(trajectories: Mapping[str, Errors]) -> str:
+def missing_errors(trajectories: Mapping[str, TrajectoryMetrics]) -> str:
     """Why no trajectory has an error; empty where one has, or where there is none."""
-    values = [column.value(errors) for column in COLUMNS for errors in trajectories.values()]
-    missing = [value.reason for value in values if isinstance(value, Missing)]
+    values = [errors.at(column.path) for column in COLUMNS for errors in trajectories.values()]
+    missing = [reason for value, reason in values if value is None]
     return missing[0] if values and len(missing) == len(values) else ""
 
 
-def _numbers(errors: Errors) -> list[str]:
-    return [written(column.value(errors), column.decimals) for column in COLUMNS]
+def _numbers(errors: TrajectoryMetrics) -> list[str]:
+    return [written(errors.at(column.path)[0], column.decimals) for column in COLUMNS]
 
 
 def _names(runs: Sequence[RunFolder]) -> list[str]:
@@ -169,7 +157,7 @@ def _contents(runs: Sequence[RunFolder]) -> list[Metrics]:
 def _metrics(run: RunFolder) -> Metrics:
     """The metrics of a run; where it was killed before it wrote them, those of its trajectories."""
     metrics = run.metrics()
-    if isinstance(metrics.trajectories, Missing) and run.trajectory("optimised") is not None:
+    if metrics.trajectories.absent and run.trajectory("optimised") is not None:
         from slam.results.estimate_metrics import metrics_of_trajectories
 
         return metrics.changed(trajectories=metrics_of_trajectories(run))

@@ -26,7 +26,6 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
 from slam.runtime.run_files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import MISSING, Missing
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
@@ -42,22 +41,22 @@ class DerivedMetrics:
     ``fusion_ms`` the time of fusion for a fused keyframe, without the refinement of its depth.
     """
 
-    network_percent: float | Missing
-    optimised_percent: float | Missing
-    of_network: float | Missing
-    fusion_ms: float | Missing
-    true_loops: int | Missing
-    false_loops: int | Missing
+    network_percent: float | None = None
+    optimised_percent: float | None = None
+    of_network: float | None = None
+    fusion_ms: float | None = None
+    true_loops: int | None = None
+    false_loops: int | None = None
 
 
 @dataclass(frozen=True)
 class ProcessMetrics:
     """Seconds of the whole command, load of the machine before, and time of a frame."""
 
-    seconds: float
-    load: float
-    ms_per_frame: float
-    cpu_ms_per_frame: float
+    seconds: float | None = None
+    load: float | None = None
+    ms_per_frame: float | None = None
+    cpu_ms_per_frame: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,11 +64,11 @@ class JobResult:
     """The metrics of a job, those derived from them and those of its process, or the reason of its failure."""
 
     job: Job
-    metrics: Metrics | Missing
+    metrics: Metrics
     commit: str
     reason: str = ""
-    derived: DerivedMetrics | Missing = MISSING
-    process: ProcessMetrics | Missing = MISSING
+    derived: DerivedMetrics = DerivedMetrics()
+    process: ProcessMetrics = ProcessMetrics()
 
 
 def simulate(drive: BenchmarkSequence) -> None:
@@ -114,11 +113,8 @@ def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
     metrics = Metrics.read(folder / METRICS) if (folder / METRICS).is_file() else Metrics()
     reason = metrics.failure or reason
     frames, seconds, cpu = metrics.sequence.frames, metrics.timing.seconds_total, metrics.timing.cpu_seconds
-    if isinstance(frames, Missing) or isinstance(seconds, Missing) or isinstance(cpu, Missing):
-        reason = reason or f"its {METRICS} has no timing"
-        return JobResult(job, Missing(reason), commit, reason)
-    if reason:
-        return JobResult(job, Missing(reason), commit, reason)
+    if reason or frames is None or seconds is None or cpu is None:
+        return JobResult(job, Metrics(), commit, reason or f"its {METRICS} has no timing")
     process = ProcessMetrics(record["seconds"], record["load"], 1e3 * seconds / frames, 1e3 * cpu / frames)
     return JobResult(job, metrics, commit, "", derive_metrics(folder, metrics), process)
 
@@ -170,7 +166,7 @@ def derive_metrics(folder: Path, metrics: Metrics) -> DerivedMetrics:
     """What follows from the metrics of a run and its files."""
     length, trajectories, stages = metrics.sequence.length_m, metrics.trajectories, metrics.timing.stages
     network, optimised = trajectories.network.align.dof7.ate_rmse_m, trajectories.optimised.align.dof7.ate_rmse_m
-    fusion = stages if isinstance(stages, Missing) else stages.get("map", Missing("no map"))
+    fusion = (stages or {}).get("map")
     return DerivedMetrics(
         ratio(network, length, 100.0),
         ratio(optimised, length, 100.0),
@@ -180,25 +176,17 @@ def derive_metrics(folder: Path, metrics: Metrics) -> DerivedMetrics:
     )
 
 
-def ratio(part: float | Missing, whole: float | Missing, unit: float) -> float | Missing:
+def ratio(part: float | None, whole: float | None, unit: float) -> float | None:
     """A part of a whole, in a unit."""
-    if isinstance(part, Missing):
-        return part
-    if isinstance(whole, Missing):
-        return whole
-    return unit * part / whole if whole else Missing("nothing to compare with")
+    return None if part is None or not whole else unit * part / whole
 
 
-def _loops(folder: Path, metrics: Metrics) -> tuple[int | Missing, int | Missing]:
-    """Number of true and of false loops."""
-    reference, number = RunFolder.open(folder).trajectory("reference"), metrics.loops.accepted
-    if reference is None:
-        number = Missing("the sequence has no true poses")
-    elif not metrics.is_metric:
-        number = Missing(f"loops in {metrics.unit} cannot be compared with metres")
-    if reference is None or isinstance(number, Missing):
-        return number, number
-    accepted = list(LoopsFile.read(folder / LOOPS).accepted)
+def _loops(folder: Path, metrics: Metrics) -> tuple[int | None, int | None]:
+    """Number of true and of false loops; None without truth in metres."""
+    reference = RunFolder.open(folder).trajectory("reference")
+    if reference is None or not metrics.is_metric or metrics.loops.accepted is None:
+        return None, None
+    accepted = LoopsFile.read(folder / LOOPS).accepted or []
     false = sum(
         is_false(np.array(loop.T_from_to), *reference.T_world_camera[[loop.from_, loop.to]]) for loop in accepted
     )

@@ -81,4 +81,4 @@ class RunRequest:
             for name, value in given.items()
             if value is not None
         }
-        return Recording(**texts)
+        return Recording.of(**texts)

@@ -24,7 +24,7 @@ from slam.results.report.verdict import verdict
 from slam.results.tables import alignments_table, errors_table, missing_errors
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
-from slam.runtime.storage.record import MISSING, Missing, known
+from slam.runtime.storage.record import NOT_RECORDED
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -80,31 +80,31 @@ def write_report(
     """
     metrics = metrics or folder.metrics()
     said, errors = verdict(metrics), metrics.evaluated_errors()
-    no_errors = missing_errors(errors)
-    optimised = known(metrics.trajectories.optimised)
+    no_errors, has_map = missing_errors(errors), metrics.map.triangles is not None
+    optimised = metrics.trajectories.optimised
     page = _TEMPLATES.get_template("page.html.j2").render(
         script=(files("slam.results.report") / "page.js").read_text("utf-8"),
         plotly=_plotly,
-        name=known(metrics.sequence.name) or folder.path.resolve().name,
+        name=metrics.sequence.name or folder.path.resolve().name,
         failure=metrics.failure,
         verdict=said,
         leak=metrics.provenance.leak is True,
-        version=known(metrics.provenance.version) or "",
+        version=metrics.provenance.version or "",
         unit_notes=metrics.unit_notes(),
         key_numbers=[] if said is None else tables.key_numbers(metrics, has_map=not said.scraps),
         what_ran=_html(tables.what_ran(metrics)),
         plots=_plots(metrics, _trajectories(folder), _loops_file(folder), view),
         errors=_html(errors_table(errors) if errors and not no_errors else None),
-        alignments=_html(alignments_table(optimised) if optimised is not None and not no_errors else None),
+        alignments=_html(alignments_table(optimised) if not optimised.absent and not no_errors else None),
         no_errors=no_errors,
         gps=_html(tables.gps(metrics)),
         depths=depths,
         depth_error=_html(tables.depth_error(metrics)),
         map_tables=[_html(tables.map_errors(metrics)), _html(tables.map_left_out(metrics))],
-        no_map=_absence(metrics, metrics.map) or _absence(metrics, metrics.map.triangles),
+        no_map=_absence(metrics, metrics.map.absent or ("" if has_map else metrics.map.why("triangles"))),
         loops=tables.loop_counts(metrics),
         loop_pictures=loops,
-        no_loops=_absence(metrics, metrics.loops),
+        no_loops=_absence(metrics, metrics.loops.absent),
         timing=_html(tables.timing(metrics)),
         files=_html(tables.files(folder)),
     )
@@ -123,11 +123,9 @@ def _loops_file(folder: RunFolder) -> LoopsFile:
         return LoopsFile()
 
 
-def _absence(metrics: Metrics, part: object) -> str:
+def _absence(metrics: Metrics, reason: str) -> str:
     """Why a run has no such part; empty where it has one, or failed before."""
-    if not isinstance(part, Missing) or (metrics.failure and part == MISSING):
-        return ""
-    return part.reason
+    return "" if metrics.failure and reason == NOT_RECORDED else reason
 
 
 def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
@@ -158,7 +156,7 @@ def _plots(
 
     has_truth = REFERENCE in trajectories and len(trajectories) > 1
     unit = "m" if metrics.unit == METRES else metrics.unit
-    gaps, accepted = known(metrics.sequence.bridged) or [], known(loops.accepted) or []
+    gaps, accepted = metrics.sequence.bridged or [], loops.accepted or []
     if trajectories:
         given = (trajectories, "m" if has_truth else unit, accepted)
         caption = _ALIGNED if has_truth else _AS_WRITTEN
@@ -170,7 +168,7 @@ def _plots(
         add("trajectories", title, caption, figures.scale_figure, trajectories, metrics.is_metric, gaps)
         caption = "Distance to the true position, after the 7-dof alignment."
         add("errors", "Position error along the path", caption, figures.error_figure, trajectories)
-        if not isinstance(metrics.trajectories.optimised.align.dof7.t_rel_percent, Missing):
+        if metrics.trajectories.optimised.align.dof7.t_rel_percent is not None:
             caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
             add("errors", "Drift by the length of segments", caption, figures.drift_figure, trajectories)
     elif trajectories:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 from urllib.parse import quote
 
@@ -14,17 +14,17 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES, GpsErrors, Metrics, Stretch
 from slam.results.tables import written
 from slam.runtime.run_files import MEANINGS, REPORT
-from slam.runtime.storage.record import NOT_RECORDED, Missing, known
+from slam.runtime.storage.record import NOT_RECORDED
 
 _MOST = 12  # of one kind
 _LEAST_SHARE = 0.0005  # that a table of percent shows
-_MAP_ERRORS: dict[str, Callable[[SurfaceMetrics | Missing], float | Missing]] = {
-    "accuracy\nmedian, m": lambda m: m.accuracy_median_m,
-    "accuracy\n90 %, m": lambda m: m.accuracy_90_m,
-    "over 1 m": lambda m: m.outlier_share,
-    "completeness\n0.3 m": lambda m: m.completeness,
-    "F-score\n0.2 m": lambda m: m.f_score.m02,
-    "F-score\n0.5 m": lambda m: m.f_score.m05,
+_MAP_ERRORS = {
+    "accuracy\nmedian, m": "accuracy_median_m",
+    "accuracy\n90 %, m": "accuracy_90_m",
+    "over 1 m": "outlier_share",
+    "completeness\n0.3 m": "completeness",
+    "F-score\n0.2 m": "f_score.m02",
+    "F-score\n0.5 m": "f_score.m05",
 }
 _FILTERS = {
     "unknown": "no depth",
@@ -60,38 +60,35 @@ def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
         ("Frames", metrics.sequence.frames, 0, ""),
         ("Speed", metrics.timing.frames_per_second, 1, "frames/s"),
         ("Loops accepted", metrics.loops.accepted, 0, ""),
-        ("Map triangles", metrics.map.triangles if has_map else Missing(), 0, ""),
+        ("Map triangles", metrics.map.triangles if has_map else None, 0, ""),
     ]
-    return [
-        (name, number(value, decimals), unit)
-        for name, value, decimals, unit in wanted
-        if not isinstance(value, Missing)
-    ]
+    return [(name, number(value, decimals), unit) for name, value, decimals, unit in wanted if value is not None]
 
 
 def what_ran(metrics: Metrics) -> Table:
     """Sequence, weights, scale and command; a run that failed early has fewer rows."""
 
-    def text(value: Any, decimals: int = 1, unit: str = "", most: int | None = None) -> str:
-        missing = f"{DASH} ({value.reason})" if isinstance(value, Missing) else ""
-        return missing or f"{written(value, decimals)[:most]}{unit}"
+    def text(path: str, decimals: int = 1, unit: str = "", most: int | None = None) -> str:
+        value, reason = metrics.at(path)
+        return f"{DASH} ({reason})" if value is None else f"{written(value, decimals)[:most]}{unit}"
 
     sequence, ran = metrics.sequence, metrics.provenance
-    leak = {True: "yes: trained on this sequence", False: "none known", None: DASH}[known(ran.leak)]
+    leak = {True: "yes: trained on this sequence", False: "none known", None: DASH}[ran.leak]
+    rate = text("sequence.fps", unit=" a second")
     rows = [
-        ("Sequence", f"{text(sequence.name)}, {text(sequence.frames)} frames, {text(sequence.fps, unit=' a second')}"),
-        ("Interpolated frames", "; ".join(by_reason(sequence.bridged))),
-        ("Doubled frames", "; ".join(by_reason(sequence.doubled))),
-        ("LiDAR scans left out", "; ".join(by_reason(sequence.unreadable_scans))),
+        ("Sequence", f"{text('sequence.name')}, {text('sequence.frames')} frames, {rate}"),
+        ("Interpolated frames", "; ".join(by_reason(sequence.bridged or ()))),
+        ("Doubled frames", "; ".join(by_reason(sequence.doubled or ()))),
+        ("LiDAR scans left out", "; ".join(by_reason(sequence.unreadable_scans or ()))),
         ("Scale", _scale(metrics)),
-        ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
+        ("Weights", f"{text('provenance.weights')}, sha256 {text('provenance.weights_sha256', most=16)}"),
         ("Depth", _depth_source(metrics)),
-        ("Licence of the weights", text(ran.weights_licence)),
-        ("Trained on", _shortened(list(ran.trained_on)) or DASH),
+        ("Licence of the weights", text("provenance.weights_licence")),
+        ("Trained on", _shortened(ran.trained_on or ()) or DASH),
         ("Leak", leak),
-        ("Command", text(ran.command)),
-        ("Seed, device", f"{text(ran.seed)}, {text(ran.device)}"),
-        ("Version, commit", f"{text(ran.version)}, {text(ran.commit)}"),
+        ("Command", text("provenance.command")),
+        ("Seed, device", f"{text('provenance.seed')}, {text('provenance.device')}"),
+        ("Version, commit", f"{text('provenance.version')}, {text('provenance.commit')}"),
     ]
     told = [row for row in rows if row[1] and not (metrics.failure and NOT_RECORDED in row[1])]
     return Table((), told, names=2)
@@ -109,16 +106,16 @@ def by_reason(found: Iterable[Stretch]) -> list[str]:
 def gps(metrics: Metrics) -> Table | None:
     """Distances from the GPS track; None without one."""
     found = metrics.gps
-    if isinstance(found, Missing):
+    if found.absent:
         return None
 
-    def row(name: str, errors: GpsErrors | Missing) -> list[str]:
+    def row(name: str, errors: GpsErrors) -> list[str]:
         values = (errors.horizontal_rmse_m, errors.horizontal_median_m, errors.vertical_rmse_m)
         return [name, *(number(value, 2) for value in values)]
 
     factors = "which are factors of the pose graph: the optimised row is no independent test"
     use = factors if found.in_graph is True else "not in the pose graph"
-    notes = [f"{known(found.fixes)} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
+    notes = [f"{found.fixes} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
     head = ("", "horizontal\nRMSE, m", "horizontal\nmedian, m", "vertical\nRMSE, m")
     return Table(head, [row("odometry", found.odometry), row("optimised", found.optimised)], notes=notes)
 
@@ -126,11 +123,11 @@ def gps(metrics: Metrics) -> Table | None:
 def loop_counts(metrics: Metrics) -> str:
     """How far loops came, in one sentence; empty where nothing is known of them."""
     found = metrics.loops
-    if isinstance(found, Missing):
+    if found.absent:
         return ""
-    stages = {"candidates": found.candidates, "measured": found.verified, "accepted": found.accepted}
-    reasons = {value.reason: None for value in stages.values() if isinstance(value, Missing)}
-    counts = ", ".join(f"{number(value)} {stage}" for stage, value in stages.items())
+    stages = {"candidates": "candidates", "verified": "measured", "accepted": "accepted"}
+    reasons = {reason: None for value, reason in map(found.at, stages) if value is None}
+    counts = ", ".join(f"{number(found.at(name)[0])} {word}" for name, word in stages.items())
     return f"{counts}{''.join(f'; {reason}' for reason in reasons)}. All are in loops.json."
 
 
@@ -139,11 +136,11 @@ def depth_error(metrics: Metrics) -> Table | None:
     rows = [
         [
             number(row.depth, 1),
-            DASH if isinstance(row.bias, Missing) else f"{100 * row.bias:+.0f} %",
-            _percent(row.sigma, 0),
+            DASH if row.bias is None else f"{100 * row.bias:+.0f} %",
+            DASH if row.sigma is None else f"{100 * row.sigma:.0f} %",
             number(row.corners),
         ]
-        for row in metrics.depth_error
+        for row in metrics.depth_error or ()
     ]
     note = (
         "Learned depth against depth triangulated from the images. Its mean error (bias) is taken out before it is "
@@ -154,7 +151,7 @@ def depth_error(metrics: Metrics) -> Table | None:
 
 def map_left_out(metrics: Metrics) -> Table | None:
     """The share of pixels that each filter took before fusion, and what cleaning the mesh took; None without a map."""
-    filters = known(metrics.map.filters)
+    filters = metrics.map.filters
     if filters is None:
         return None
     shares = {name: (share, _FILTERS.get(name, "")) for name, share in filters.items()}
@@ -165,7 +162,7 @@ def map_left_out(metrics: Metrics) -> Table | None:
         ("floaters", metrics.map.floater_share, loose),
         ("double walls", metrics.map.double_wall_share, double),
     ):
-        shares[name] = (known(part) or 0.0, what)
+        shares[name] = (part or 0.0, what)
     rows = [[name, f"{share:.1%}", what] for name, (share, what) in shares.items() if share >= _LEAST_SHARE]
     side = f"{number(metrics.map.voxel_size, 2)} {'m' if metrics.is_metric else 'units'}"
     note = f"{number(metrics.map.frames_fused)} keyframes, voxels of {side}."
@@ -175,17 +172,17 @@ def map_left_out(metrics: Metrics) -> Table | None:
 def map_errors(metrics: Metrics) -> Table | None:
     """Errors of the map under both alignments, and by distance from the camera; None without a map."""
     found = metrics.map
-    if isinstance(found, Missing) or isinstance(found.triangles, Missing):
+    if found.triangles is None:
         return None
-    if isinstance(found.truth, Missing):
-        return Table((), (), notes=[f"No error of the map: {found.truth.reason}."])
-    rows: dict[str, SurfaceMetrics | Missing] = {"one rigid motion": found} if metrics.is_metric else {}
-    if not isinstance(found.in_field.share, Missing) and found.in_field.share != 1.0:
+    if found.truth is None:
+        return Table((), (), notes=[f"No error of the map: {found.why('truth')}."])
+    rows: dict[str, SurfaceMetrics] = {"one rigid motion": found} if metrics.is_metric else {}
+    if found.in_field.share not in (None, 1.0):
         rows["where the scanner looked"] = found.in_field
     rows["with one scale"] = found.with_scale
-    rings = found.with_scale.by_distance if isinstance(found.by_distance, Missing) else found.by_distance
-    rows |= {f"{known(ring.from_m):.0f} to {known(ring.to_m):.0f} m from the camera": ring for ring in rings}
-    texts = [[name, *(number(value(each), 3) for value in _MAP_ERRORS.values())] for name, each in rows.items()]
+    rings = found.with_scale.by_distance if found.by_distance is None else found.by_distance
+    rows |= {f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera": ring for ring in rings or ()}
+    texts = [[name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())] for name, each in rows.items()]
     truth, length = _TRUTHS.get(found.truth, found.truth), number(found.evaluated_m)
     note = f"Against {truth}, {length} m of the path. Map where no surface was measured is an error."
     return Table(("", *_MAP_ERRORS), texts, notes=[note])
@@ -193,11 +190,11 @@ def map_errors(metrics: Metrics) -> Table | None:
 
 def timing(metrics: Metrics) -> Table | None:
     """Seconds by stage, the longest first; None where nothing was timed."""
-    stages = known(metrics.timing.stages)
+    stages = metrics.timing.stages
     if not stages:
         return None
     timed = sum(stages.values())
-    total = max(known(metrics.timing.seconds_total) or 0.0, timed, 1e-9)
+    total = max(metrics.timing.seconds_total or 0.0, timed, 1e-9)
     ordered = sorted((stages | {"between stages": total - timed}).items(), key=lambda item: -item[1])
     rows = [[name, f"{seconds:.1f}", f"{seconds / total:.0%}"] for name, seconds in ordered if seconds >= 0.005 * total]
     memory, processor = (number(each) for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds))
@@ -221,25 +218,21 @@ def files(folder: RunFolder) -> Table | None:
 
 def _scale(metrics: Metrics) -> str:
     scale = metrics.scale
-    if isinstance(scale.value, Missing):
-        return f"mode {known(scale.mode) or DASH}, {scale.value.reason}"
-    spread, frames = known(scale.spread), known(scale.frames_used)
+    if scale.value is None:
+        return f"mode {scale.mode or DASH}, {scale.why('value')}"
+    spread, frames = scale.spread, scale.frames_used
     unit = metrics.unit if metrics.unit in (METRES, CAMERA_HEIGHTS) else "units of the result"
     certain = "" if spread is None else f", spread {100 * spread:.1f} %"
     used = "" if frames is None else f", measured in {frames} frames"
-    return f"mode {known(scale.mode)}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
+    return f"mode {scale.mode}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
 
 
 def _depth_source(metrics: Metrics) -> str:
     name = metrics.provenance.depth_source
-    if isinstance(name, Missing):
-        return f"{DASH} ({name.reason})"
-    sha256 = known(metrics.provenance.depth_sha256)
+    if name is None:
+        return f"{DASH} ({metrics.provenance.why('depth_source')})"
+    sha256 = metrics.provenance.depth_sha256
     return "by these weights" if name == "network" else f"{name}, sha256 {str(sha256)[:16]}"
-
-
-def _percent(share: float | Missing, decimals: int) -> str:
-    return DASH if isinstance(share, Missing) else f"{100 * share:.{decimals}f} %"
 
 
 def _shortened(names: Sequence[str]) -> str:

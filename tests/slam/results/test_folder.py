@@ -13,8 +13,8 @@ import pytest
 import slam
 from slam.results.folder import RunFolder
 from slam.results.metrics import MapMetrics, Metrics, Provenance
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import RunError
-from slam.runtime.storage.record import Missing
 
 MakeRun = Callable[..., RunFolder]
 
@@ -127,10 +127,10 @@ def test_trajectories_survive_a_round_trip(make_run: MakeRun) -> None:
 def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -> None:
     folder = make_run()
     (folder.path / "map_mesh.ply").unlink()
-    folder.write_metrics(folder.metrics().changed(map=MapMetrics.missing(reason)))
+    folder.write_metrics(folder.metrics().changed(map=MapMetrics.unknown(reason)))
     with pytest.raises(RunError, match=re.escape(f"has no map_mesh.ply: {reason}")):
         folder.require("map_mesh.ply")
-    folder.write_metrics(folder.metrics().changed(map=Missing("the run ended before its map was whole")))
+    folder.write_metrics(folder.metrics().changed(map=Failed("the run ended before its map was whole")))
     with pytest.raises(RunError, match=r"has no map_mesh\.ply: the run ended before its map was whole"):
         folder.require("map_mesh.ply")
 

@@ -13,7 +13,6 @@ from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.tables import alignments_table, errors_table, runs_table
-from slam.runtime.storage.record import Missing
 
 MakeRun = Callable[..., RunFolder]
 MakeMetrics = Callable[..., dict[str, Any]]
@@ -94,7 +93,11 @@ def test_two_files_are_compared_under_every_alignment(printed: Callable[[Table],
 
 
 def test_missing_numbers_are_dashes_with_one_reason_each(printed: Callable[[Table], str]) -> None:
-    text = printed(errors_table({"network": errors_of(50), "odometry": errors_of(50), "lidar": Missing()}))
+    text = printed(
+        errors_table(
+            {"network": errors_of(50), "odometry": errors_of(50), "lidar": TrajectoryMetrics(absent="not recorded")}
+        )
+    )
     assert text.count("no segment of 100 m fits") == 1 and "– network, odometry: no segment" in text
     assert "– lidar: not recorded." in text
     assert next(line for line in text.splitlines() if "lidar" in line).split() == ["lidar", *["–"] * 6]

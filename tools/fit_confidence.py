@@ -22,8 +22,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from shared.command import markdown, one_line_errors, parser_of
+from shared.command import one_line_errors, parser_of
 
+from erfsfm.common.table import Table
 from slam.frontend.agreement import CONFIDENCE, share_right
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
@@ -98,7 +99,8 @@ def main(words: Sequence[str] | None = None) -> None:
     }
     stated = np.array([share_right(each.sigmas, constants[each.drive]) for each in known_cameras])
     right = np.mean([each.error <= RIGHT for each in known_cameras])
-    print(markdown(("confidence by the other drives", "runs", "mean", "share right"), rows(known_cameras, stated), 3))
+    head = ("confidence by the other drives", "runs", "mean", "share right")
+    print(Table(head, rows(known_cameras, stated)).markdown())
     in_use = np.array([share_right(each.sigmas, CONFIDENCE) for each in known_cameras])
     scores = brier(known_cameras, stated), brier(known_cameras, in_use), right * (1 - right)
     print("Brier score {:.3f} by the other drives, {:.3f} as in use, {:.3f} of a constant".format(*scores))

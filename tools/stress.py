@@ -19,8 +19,9 @@ from typing import get_args
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from shared.command import markdown, one_line_errors, parser_of
+from shared.command import one_line_errors, parser_of
 
+from erfsfm.common.table import Table
 from slam import run_slam
 from slam.frames import Sequence as FrameSequence
 from slam.geometry.se3 import FloatArray
@@ -189,7 +190,7 @@ def main(words: Sequence[str] | None = None) -> None:
         for change in o.change or CHANGES:
             rows.append(row(f"{camera.name}, {change}", CHANGES[change](drive), camera, o.weights, o.keep))
             print(*rows[-1][:3], file=sys.stderr)
-    print(markdown(("drive", "error, % of the path", "confidence", "said"), rows))
+    print(Table(("drive", "error, % of the path", "confidence", "said"), rows, names=4).markdown())
 
 
 if __name__ == "__main__":

@@ -51,6 +51,14 @@ def progress_lines(write: Callable[[str], object], every_s: float = _EVERY_S) ->
         thread.join()
 
 
+def duration(seconds: int) -> str:
+    """A time in words, to two units at most."""
+    minutes, hours = seconds // 60, seconds // 3600
+    if hours >= 48:
+        return f"{hours / 24:.1f} days"
+    return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {seconds % 60} s"
+
+
 class _Lines:
     def __init__(self) -> None:
         self.stage = ""
@@ -68,8 +76,7 @@ class _Lines:
         if done <= 0 or spent_s <= 0 or self._done >= self._total:
             return f"{text} after {spent_s:.0f} s"
         left_s = round((self._total - self._done) * spent_s / done)
-        days, minutes = left_s / 86400, f"{left_s // 60} min {left_s % 60} s"
-        return f"{text}, {done / spent_s:.2g} a second, {f'{days:.1f} days' if days > 2 else minutes} left"
+        return f"{text}, {done / spent_s:.2g} a second, {duration(left_s)} left"
 
 
 @contextmanager

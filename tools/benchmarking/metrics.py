@@ -10,9 +10,8 @@ from typing import Any
 
 from benchmarking.plan import slug
 from benchmarking.work import JobResult, ratio
-from shared.command import markdown
 
-from slam.results.error_columns import DASH
+from erfsfm.common.table import DASH, Table
 
 Label = Callable[[JobResult], str]
 Cell = Callable[[Sequence[JobResult]], str]
@@ -127,7 +126,7 @@ def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Seque
     """Markdown: one row for each group of results that share their labels."""
     groups = grouped(results, *rows.values()).items()
     cells = [[*label, *(cell(group) for cell in columns.values())] for label, group in groups]
-    return markdown([*rows, *columns], cells, numbers=len(columns))
+    return Table([*rows, *columns], cells, names=len(rows)).markdown()
 
 
 def grouped(results: Sequence[JobResult], *labels: Label) -> dict[tuple[str, ...], list[JobResult]]:

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from shared.pictures import draw_trajectories, trajectories_of
 
-from slam.results.error_columns import DASH
+from erfsfm.common.table import DASH
 from slam.results.folder import RunFolder
 from slam.runtime.storage.files import write_atomically
 

@@ -18,9 +18,9 @@ import numpy as np
 from benchmarking import plan
 from benchmarking.plan import BenchmarkSequence, Job
 
-from slam.commands.batch import cluster
-from slam.commands.batch.cluster import Spread
-from slam.commands.batch.execution import why_ended
+from erfsfm.common.processes import slam_process
+from slam.commands import cluster
+from slam.commands.cluster import Spread
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
@@ -74,7 +74,7 @@ class JobResult:
 def simulate(drive: BenchmarkSequence) -> None:
     """Simulate a world where it is missing; `measured` checks that it was made."""
     if not drive.root.exists():
-        subprocess.run(_slam("simulate", str(drive.root), *drive.simulate), stdout=subprocess.DEVNULL, check=False)
+        slam_process(["simulate", str(drive.root), *drive.simulate])
 
 
 def perform(job: Job) -> None:
@@ -85,8 +85,8 @@ def perform(job: Job) -> None:
     job.place.mkdir(parents=True)
     record = {"identity": _identity(job), "load": os.getloadavg()[0]}
     start = time.perf_counter()
-    finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
-    record |= {"seconds": time.perf_counter() - start, "reason": why_ended(finished.returncode, finished.stderr)}
+    reason = slam_process(job.arguments)
+    record |= {"seconds": time.perf_counter() - start, "reason": reason}
     for name in BULKY:
         (job.place / "run" / name).unlink(missing_ok=True)
     write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
@@ -117,11 +117,6 @@ def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
         return JobResult(job, Metrics(), commit, reason or f"its {METRICS} has no timing")
     process = ProcessMetrics(record["seconds"], record["load"], 1e3 * seconds / frames, 1e3 * cpu / frames)
     return JobResult(job, metrics, commit, "", derive_metrics(folder, metrics), process)
-
-
-def _slam(*arguments: str) -> list[str]:
-    """``erfsfm-slam`` of this interpreter, whatever the working directory holds."""
-    return [sys.executable, "-P", "-m", "slam", *arguments]
 
 
 def revision(checkout: Path = ROOT) -> str:

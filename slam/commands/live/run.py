@@ -63,9 +63,9 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         if request.view:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
-        source = open_source(request.source, request.wait)
-        camera = calibration_of(request.source, request.camera_file, source)
-        source.fps, intrinsics, name = camera.fps, intrinsics_of(camera), Path(request.source).stem or "live"
+        source = open_source(request.dataset, request.wait)
+        camera = calibration_of(request.dataset, request.camera, source)
+        source.fps, intrinsics, name = camera.fps, intrinsics_of(camera), Path(request.dataset).stem or "live"
         prediction = open_prediction(request.weights, request.device, settings.depth, intrinsics)
         networks = prediction.networks
         growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
@@ -75,14 +75,14 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         networks.poses([blank] * (networks.sources + 1))
         viewer = Viewer(intrinsics) if request.view else None
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
-        sequence.intrinsics = as_known(sequence.intrinsics, request.camera_file)
+        sequence.intrinsics = as_known(sequence.intrinsics, request.camera)
         reader = sequence.reader
         try:
             pipeline = SlamPipeline(sequence, prediction.predictor, settings, seed=request.seed)
             folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
             recorded = RunRequest(
-                Path(request.source),
-                camera=request.camera_file,
+                Path(request.dataset),
+                camera=request.camera,
                 weights=request.weights,
                 seed=request.seed,
                 command=request.command,

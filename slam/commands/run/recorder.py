@@ -24,9 +24,8 @@ from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors
 from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
-from slam.results.report.page import write_report
+from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
-from slam.results.report.rendering import Picture
 from slam.runtime.attempt import Failed, attempt
 from slam.runtime.errors import EmptyMapError, SlamError
 from slam.runtime.run_files import CONFIG, GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, PLACES

@@ -24,11 +24,12 @@ _LEAST_FUSED = 0.15  # of the depth of all keyframes: maps of streets and rooms 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A sentence, signs that speak for the run, and doubts."""
+    """A sentence, signs that speak for the run, doubts, and why its map is no more than ``scraps``."""
 
     sentence: str
     signs: Sequence[str]
     doubts: Sequence[str]
+    scraps: str = ""
 
 
 def verdict(metrics: Metrics) -> Verdict | None:
@@ -36,11 +37,14 @@ def verdict(metrics: Metrics) -> Verdict | None:
     if metrics.failure:
         return None
     found: tuple[list[str], list[str]] = [], []
+    scraps = _scraps(metrics)
     for part in (_confidence, _loops, _agreement, _unit, _noise, _frames, _map):
         for is_sign, words in part(metrics):
             found[0 if is_sign else 1].append(words)
+    if scraps:
+        found[1].append(scraps)
     confirmed = next((words for is_sign, words in _loops(metrics) if is_sign), "")
-    return Verdict(_sentence(metrics, confirmed), *found)
+    return Verdict(_sentence(metrics, confirmed), *found, scraps)
 
 
 def percent(share: float) -> str:
@@ -95,16 +99,16 @@ def _confidence(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     if sure is not None:
         yield sure > _SURE, f"{percent(sure)} of drives with images like its own err by at most 1 % of their path"
     elif not metrics.confidence.absent:
-        yield False, f"nobody knows how sure it is: {metrics.confidence.why('run')}"
+        yield False, f"its confidence is not known: {metrics.confidence.why('run')}"
 
 
 def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     for each in metrics.agreement or ():
-        sigmas = each.sigmas or 0.0
-        if sigmas <= DOUBTFUL and each.beside != "the images":
-            continue  # `_confidence` says it of all
-        verb = "agrees with" if sigmas <= DOUBTFUL else "contradicts"
-        yield sigmas <= DOUBTFUL, f"{each.source} {verb} {each.beside} ({sigmas:.1f} sigmas: {each.figure})"
+        agrees = (each.sigmas or 0.0) <= DOUBTFUL
+        if each.beside == "the images":
+            yield agrees, f"{each.source} {'agrees with' if agrees else 'contradicts'} the images: {each.figure}"
+        elif not agrees:  # `_confidence` says of all whether the run is like good ones
+            yield False, f"{each.source}: {each.figure}"
     off = metrics.gps.optimised.horizontal_rmse_m
     if off is not None:
         within = "" if metrics.gps.in_graph is True else ", which it did not use"
@@ -129,7 +133,10 @@ def _frames(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     if doubled := sum(each.last - each.first + 1 for each in sequence.doubled or ()):
         yield False, f"{_count(doubled, 'frame')} repeat the one before while the camera moves"
     if (maps := metrics.tracking.maps or 1) > 1:
-        yield False, f"tracking was lost: {maps} maps are not joined"
+        lost = ", ".join(
+            str(event.frame) for event in metrics.tracking.events or () if event.frame and "begun" in event.event
+        )
+        yield False, f"tracking was lost{f' at frames {lost}' if lost else ''}: {maps} maps are not joined"
     if metrics.provenance.leak is True:
         yield False, "LEAK: its weights saw this sequence, or a part of it, in training"
 
@@ -138,11 +145,21 @@ def _map(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     off = metrics.map.accuracy_median_m
     if off is not None:
         yield True, f"its map lies {off:.2g} m (median) from the true surface"
+
+
+def _scraps(metrics: Metrics) -> str:
+    """What is wrong with a map of which too little was fused; empty of a whole one, or without a map."""
     frames, filters = metrics.map.frames_fused, metrics.map.filters
-    if frames and filters:
-        fused = (1.0 - sum(filters.values())) * frames / (frames + (metrics.map.frames_left_out or 0))
-        if fused < _LEAST_FUSED:
-            yield False, f"{percent(1.0 - fused)} of the depth of its keyframes was thrown away before the map"
+    if not frames or not filters:
+        return ""
+    fused = (1.0 - sum(filters.values())) * frames / (frames + (metrics.map.frames_left_out or 0))
+    if fused >= _LEAST_FUSED:
+        return ""
+    most = max(filters, key=filters.__getitem__)
+    return (
+        f"its map is scraps: {percent(fused)} of the depth of its keyframes was good enough to fuse, 35 to 60 % is "
+        f"usual; most was left out by the filter {most} ({percent(filters[most])})"
+    )
 
 
 def _count(number: int, noun: str) -> str:

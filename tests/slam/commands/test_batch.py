@@ -17,11 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from slam.commands.batch.cluster import workers
-from slam.commands.batch.execution import Limits, run_drive, run_drives
-from slam.commands.batch.manifest import Drive, drives_of
-from slam.commands.batch.summary import check_output, write_summary
+from slam.commands.batch import Drive, check_output, drives_of, run_drive, run_drives
 from slam.commands.cli import main
+from slam.commands.cluster import workers
 from slam.runtime.errors import RunError, SequenceError, SlamError
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -108,7 +106,7 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_
 
     options = [*words[:6], "--weights", str(tiny_weights), "--frames", "0:6", "--seed", "0", "--device", "auto"]
     (good, _) = drives_of(manifest, ["all"], options)
-    assert run_drive(good, output, Limits()).status == "kept"
+    assert run_drive(good, output).status == "kept"
     assert (output / "good" / "metrics.json").stat().st_mtime_ns == written
 
 
@@ -119,9 +117,8 @@ def test_a_drive_that_needs_too_much_memory_is_ended(kitti_root: Path, tiny_weig
     command = shlex.join(["erfsfm-slam", "run", *sim.arguments, "--output", str(tmp_path / "sim")])
     ended = {"status": "estimated", "provenance": {"command": command}}
     (tmp_path / "sim" / "metrics.json").write_text(json.dumps(ended))
-    outcome = run_drive(sim, tmp_path, Limits(threads=1, memory_gib=0.05))
+    (outcome,) = run_drives([sim], tmp_path, 1, None, silent, threads=1, memory_gib=0.05)
     assert outcome.status == "failed" and "more than the 0.1 GiB of --memory" in outcome.reason
-    write_summary(tmp_path, [outcome])
     assert "more than the 0.1 GiB" in (tmp_path / "drives.csv").read_text()
     check_output(tmp_path, [sim])
 
@@ -183,8 +180,7 @@ def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path) -> None:
 
 def test_an_error_of_the_engine_is_the_drives_reason(tmp_path: Path) -> None:
     drive = Drive("a", tmp_path / "gone", ())
-    with workers(1) as spread:
-        (outcome,) = run_drives([drive], tmp_path / "out", Limits(), spread, silent)
+    (outcome,) = run_drives([drive], tmp_path / "out", 1, None, silent)
     assert outcome.status == "failed" and outcome.reason.startswith("FileNotFoundError")
 
 
@@ -198,7 +194,7 @@ def test_a_drive_ends_with_its_worker(tmp_path: Path) -> None:
     """Its standard input is closed as by the death of the worker."""
     output = tmp_path / "run"
     arguments = [str(tmp_path / "lock"), "run", "--output", str(output)]
-    command = [sys.executable, "-m", "slam.commands.batch.process", *arguments]
+    command = [sys.executable, "-m", "slam.commands.batch_process", *arguments]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         while not (output / "run.log").exists() and process.poll() is None:
             time.sleep(0.05)

@@ -1,4 +1,4 @@
-"""The board: its corners in its own plane, and where an image shows them."""
+"""The board: its corners in its own plane, where images show them, and which of them together say most."""
 
 from __future__ import annotations
 
@@ -10,18 +10,23 @@ import cv2
 import numpy as np
 from scipy.spatial.distance import pdist
 
+from erfsfm.common.progress import Progress
 from slam.frames import Grey
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import CalibrationError
+from slam.sequences.images import ImageSource
 
 Pattern = Literal["chessboard", "charuco"]
 
 _BOARD = re.compile(r"(\d+)x(\d+)")
 _FEWEST = 3  # corners along one side
-_PROBE = (4, 3)  # corners of a part of a chessboard
 _LEAST_CHARUCO = 12  # corners of a view: more than a homography needs
 _WINDOW, _MOST_HALF_WINDOW_PX = 0.2, 11  # of the distance to the next corner
 _DICTIONARY = re.compile(r"\dX\d_\d+")
+_MOST_VIEWS = 40
+FEWEST_VIEWS = 8
+_MOST_SEARCHED = 300  # images of a video
+_BLURRED = 0.3  # of the median sharpness
 
 
 @dataclass(frozen=True)
@@ -111,11 +116,6 @@ class Detector:
         refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
         return np.asarray(refined, np.float64).reshape(-1, 2)
 
-    def sees_part(self, grey: Grey) -> bool:
-        """Whether a chessboard that is not found as a whole is there in part."""
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-        return self._charuco is None and bool(cv2.findChessboardCornersSB(grey, _PROBE, flags=flags)[0])
-
 
 def parse_board(text: str) -> tuple[int, int]:
     """Columns and rows of corners from ``9x6``.
@@ -130,3 +130,81 @@ def parse_board(text: str) -> tuple[int, int]:
             f"--board {text} is no board: write the corners between its squares, 9x6 for 10 by 7 squares, 3 or more"
         )
     return columns, rows
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image of a board.
+
+    Attributes:
+        frame: its number.
+        pixels: the corners ``(N, 2)``.
+        corners_m: the same on the board ``(N, 3)``.
+        sharpness: variance of the Laplacian on the board over the variance of its grey levels.
+        place: where and how the board is seen ``(5,)``: its middle, its size and its tilt about both axes.
+    """
+
+    frame: int
+    pixels: FloatArray
+    corners_m: FloatArray
+    sharpness: float
+    place: FloatArray
+
+
+def find_views(images: ImageSource, board: Board, progress: Progress) -> list[View]:
+    """All views of a board, of a long video in every n-th image.
+
+    Raises:
+        CalibrationError: too few images show the board.
+        DataError, SequenceError: an image cannot be read.
+    """
+    detector = Detector(board)
+    step = -(-len(images) // _MOST_SEARCHED)
+    frames = range(0, len(images), step)
+    views = []
+    for count, frame in enumerate(frames, start=1):
+        grey = np.asarray(cv2.cvtColor(images.read(frame), cv2.COLOR_RGB2GRAY), np.uint8)
+        found = detector.find(grey)
+        if found is not None:
+            views.append(_view(frame, grey, *found))
+        progress("images", count, len(frames))
+    if len(views) < FEWEST_VIEWS:
+        raise CalibrationError(
+            f"{len(views)} of {len(frames)} images show the whole {board.describe()}, {FEWEST_VIEWS} are needed: take "
+            "20 or more sharp images with all of the board in them, at many places and tilts; --board counts the "
+            "corners between its squares"
+        )
+    return views
+
+
+def chosen_views(views: list[View]) -> list[View]:
+    """At most 40 views that differ most from each other, sharp ones first, in the order of time.
+
+    The next is always the one whose place is furthest from those of all before, times its sharpness' rank.
+    """
+    median = float(np.median([view.sharpness for view in views]))
+    sharp = [view for view in views if view.sharpness >= _BLURRED * median]
+    if len(sharp) <= _MOST_VIEWS:
+        return sharp
+    ranks = np.argsort(np.argsort([view.sharpness for view in sharp])) / (len(sharp) - 1)
+    places = np.array([view.place for view in sharp])
+    taken = [int(np.argmax(ranks))]
+    distances = np.full(len(sharp), np.inf)
+    while len(taken) < _MOST_VIEWS:
+        distances = np.minimum(distances, np.linalg.norm(places - places[taken[-1]], axis=1))
+        taken.append(int(np.argmax(distances * (1 + ranks))))
+    return [sharp[k] for k in sorted(set(taken))]
+
+
+def _view(frame: int, grey: Grey, pixels: FloatArray, corners_m: FloatArray) -> View:
+    height, width = grey.shape
+    hull = cv2.convexHull(pixels.astype(np.float32))
+    mask = cv2.fillConvexPoly(np.zeros_like(grey), np.rint(hull).astype(np.int32), 255) > 0
+    sharpness = float(cv2.Laplacian(grey, cv2.CV_64F)[mask].var() / max(float(grey[mask].var()), 1.0))
+    extent = np.ptp(corners_m[:, :2], axis=0)
+    plane = (corners_m[:, :2] - corners_m[:, :2].mean(axis=0)) / extent
+    homography, _ = cv2.findHomography(plane, pixels / width)
+    tilt = np.zeros(2) if homography is None else homography[2, :2] / homography[2, 2]
+    middle = pixels.mean(axis=0) / [width, height]
+    size = np.sqrt(cv2.contourArea(hull) / (width * height))
+    return View(frame, pixels, corners_m, sharpness, np.array([*middle, size, *tilt]))

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import CameraFile
-from slam.commands.localisation.localiser import Localiser, image_numbers, localise
-from slam.commands.localisation.tables import localisation_json, localisation_table, write_localisations
+from slam.commands.localisation import Localiser, image_numbers, localisation_table, localise, write_localisations
 from slam.config.sections import LoopsConfig, dump_yaml, load_config
 from slam.formats.trajectory import Trajectory, associate, read_trajectory, write_kitti
 from slam.frames import Frame, Image, Intrinsics
@@ -194,7 +193,7 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     assert [each.image for each in found] == ["10.png", "25.png", "40.png", "50.png", "60.png"]
     assert [each.T_world_camera is not None for each in found] == [True, True, True, False, False]
     assert "60.png" in found[4].reason
-    entries = json.loads(json.dumps(localisation_json(found), allow_nan=False))
+    entries = json.loads(json.dumps([each.tree() for each in found], allow_nan=False))
     assert entries[1]["found"] and abs(entries[1]["nearest_frame"] - 25) <= 2
     assert entries[3] | {"reason": ""} == {
         "image": "50.png",

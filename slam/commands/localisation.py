@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,9 +17,11 @@ from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.common.readers.folder import image_folder
 from erfsfm.common.readers.images import list_images, read_image
 from erfsfm.common.readers.numbering import in_order
+from erfsfm.common.table import DASH, Table
 from slam.config.sections import LoopsConfig, load_stored
+from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.frontend.keyframes.camera_pose import CameraPose, resect
+from slam.frontend.keyframes.camera_pose import resect
 from slam.geometry.resection import consensus
 from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_matrix
 from slam.loops.descriptors import FeatureExtractor, hamming
@@ -56,6 +59,16 @@ class Localisation:
     nearest_frame: int | None = None
     inliers: int = 0
     reason: str = ""
+
+    def tree(self) -> dict[str, Any]:
+        """For JSON: unknown values are null, with the reason."""
+        T_world_camera = self.T_world_camera
+        entry = {"image": self.image, "found": T_world_camera is not None}
+        if T_world_camera is None:
+            values: dict[str, Any] = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
+            return entry | values | {"reason": self.reason}
+        pose = {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
+        return entry | pose | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
 
 
 def image_numbers(images: Path, frames: str | None = None, every: int = 1) -> range:
@@ -104,18 +117,42 @@ def localise(
     for path in chosen:
         try:
             image = read_image(path)
-        except DataError as error:
-            unreadable += 1
+            yield localiser.locate(path.name, image if undistortion is None else undistortion.apply(image))
+        except (DataError, SequenceError) as error:
+            unreadable += isinstance(error, DataError)
             if unreadable == len(chosen):
                 raise  # not one of them is an image
             yield Localisation(path.name, reason=str(error))
-            continue
-        try:
-            if undistortion is not None:
-                image = undistortion.apply(image)
-            yield localiser.locate(path.name, image)
-        except SequenceError as error:
-            yield Localisation(path.name, reason=str(error))
+
+
+def localisation_table(found: Sequence[Localisation]) -> Table:
+    """One row an image: position in the map, nearest frame of the run, inliers; below, why one is not found."""
+    rows = []
+    for each in found:
+        row = [each.image, *[DASH] * 5]
+        if each.T_world_camera is not None:
+            position = (f"{value:.2f}" for value in each.T_world_camera[:3, 3])
+            row[1:] = [*position, str(each.nearest_frame), str(each.inliers)]
+        rows.append(row)
+    notes = [f"{each.image} not found: {each.reason}" for each in found if each.T_world_camera is None]
+    head = ["image", "x", "y", "z", "nearest\nframe", "inliers"]
+    return Table(head, rows, f"{len(found) - len(notes)} of {len(found)} images found", notes)
+
+
+def write_localisations(path: Path, found: Sequence[Localisation], numbers: Sequence[int] | None = None) -> None:
+    """Write the poses found: as TUM, or after the number of their frame as KITTI where the name ends in ``.kitti``.
+
+    The stamp, or number, is that of the image, by default its place in the list.
+
+    Raises:
+        RunError: no image was found.
+    """
+    stamps = range(len(found)) if numbers is None else numbers
+    poses = {k: each.T_world_camera for k, each in zip(stamps, found, strict=True) if each.T_world_camera is not None}
+    if not poses:
+        raise RunError(f"none of {len(found)} images was found in the map: {path} is not written")
+    write = write_kitti if path.suffix == ".kitti" else write_tum
+    write(path, Trajectory(np.array(list(poses), dtype=np.float64), np.stack(list(poses.values())), numbered=True))
 
 
 class Localiser:
@@ -150,14 +187,13 @@ class Localiser:
         if not rows:
             return Localisation(name, reason="no place of the map is similar")
         learned = self._structure.confirms_depth(rows)
-        found = self._found(rows, view, learned)
-        if isinstance(found, str):
-            found = self._found(rows, view, not learned)
-        if isinstance(found, str):
-            return Localisation(name, reason=f"{len(rows)} similar places; {found}")
+        found = self._found(name, rows, view, learned)
+        if found.T_world_camera is None:
+            found = self._found(name, rows, view, not learned)
+        if found.T_world_camera is None:
+            return replace(found, reason=f"{len(rows)} similar places; {found.reason}")
         away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
-        nearest = self._places.views[int(away.argmin())].index
-        return Localisation(name, found.T_world_camera, nearest, found.inliers)
+        return replace(found, nearest_frame=self._places.views[int(away.argmin())].index)
 
     def _view(self, image: Image) -> View:
         camera = self._intrinsics
@@ -172,29 +208,41 @@ class Localiser:
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
-    def _found(self, rows: list[int], view: View, learned: bool) -> _Pose | str:
+    def _found(self, name: str, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
         starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
         starts.sort(key=lambda start: len(start[2]), reverse=True)
-        found = [self._refined(start, rows, view, learned) for start in starts[:_STARTS]]
-        if not found:
-            return "no place has corners that fit one pose"
-        poses = [each for each in found if isinstance(each, _Pose)]
-        return max(poses, key=lambda pose: pose.inliers) if poses else found[0]
+        found = [self._refined(name, start, rows, view, learned) for start in starts[:_STARTS]]
+        nowhere = Localisation(name, reason="no place has corners that fit one pose")
+        return max(found, key=lambda each: each.inliers, default=nowhere)
 
     def _refined(
-        self, start: tuple[FloatArray, FloatArray, NDArray[np.intp]], rows: list[int], view: View, learned: bool
-    ) -> _Pose | str:
+        self,
+        name: str,
+        start: tuple[FloatArray, FloatArray, NDArray[np.intp]],
+        rows: list[int],
+        view: View,
+        learned: bool,
+    ) -> Localisation:
         """The pose by all corners of the map around a first one; or why it is none."""
         T_camera_world = make(rotation_matrix(start[0]), start[1])
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
             if len(points) < self._thresholds.min_inliers:
-                return f"only {len(points)} corners agree"
+                return Localisation(name, reason=f"only {len(points)} corners agree")
             pose = resect([T_camera_world], points, pixels, self._intrinsics)
             T_camera_world = pose.T_camera_world
-        return self._accepted(pose, points)
+        inliers = pose.residual_px < self._thresholds.reprojection_px
+        count = int(inliers.sum())
+        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
+            return Localisation(name, reason=f"only {count} of {len(inliers)} corners agree")
+        depth = float(np.median(apply(T_camera_world, points[inliers])[:, 2]))
+        sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
+        if sigma > _MOST_SIGMA:
+            reason = f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
+            return Localisation(name, reason=reason)
+        return Localisation(name, invert(T_camera_world), inliers=count)
 
     def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, FloatArray, NDArray[np.intp]] | None:
         """The pose by one place, as `consensus` gives it."""
@@ -225,26 +273,6 @@ class Localiser:
         best = differing.argmin(axis=1)
         corners = np.flatnonzero(differing[np.arange(len(view)), best] <= _MOST_DIFFERING)
         return points[best[corners]], view.pixels[corners].astype(np.float64)
-
-    def _accepted(self, pose: CameraPose, points: FloatArray) -> _Pose | str:
-        """The pose, if enough corners agree and determine it."""
-        inliers = pose.residual_px < self._thresholds.reprojection_px
-        count = int(inliers.sum())
-        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
-            return f"only {count} of {len(inliers)} corners agree"
-        depth = float(np.median(apply(pose.T_camera_world, points[inliers])[:, 2]))
-        sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
-        if sigma > _MOST_SIGMA:
-            return f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
-        return _Pose(invert(pose.T_camera_world), count)
-
-
-@dataclass(frozen=True)
-class _Pose:
-    """The pose of the image and its number of inliers."""
-
-    T_world_camera: FloatArray
-    inliers: int
 
 
 def image_paths(images: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""One drive in a process of its own: ``python -m slam.commands.batch.process LOCK run ...``.
+"""One drive of a batch in a process of its own: ``python -m slam.commands.batch_process LOCK run ...``.
 
 The process ends when its standard input does, that is when the worker that started it dies, and it waits for a lock, so
 that two of them never write to one folder.

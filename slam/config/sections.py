@@ -5,15 +5,16 @@ A YAML file may leave keys out, which then have their defaults; ``configs/slam/d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+import erfsfm.common.errors
 from erfsfm.common.config_tree import Section
 from erfsfm.common.config_tree import dump_explained as dump_yaml
-from slam.config.files import load_sections
+from erfsfm.common.config_tree import load_config as load_tree
 from slam.config.frontend import (
     GapsConfig,
     GpsConfig,
@@ -24,6 +25,7 @@ from slam.config.frontend import (
     ScaleMode,
     VisualOdometryConfig,
 )
+from slam.runtime.errors import ConfigError
 from slam.runtime.imports import plug_ins
 
 __all__ = [
@@ -44,7 +46,8 @@ __all__ = [
     "load_config",
 ]
 
-
+_HERE = Path(__file__).resolve().parents[1]
+_SHIPPED = (_HERE.parent / "configs" / "slam", _HERE / "_configs")  # in the source tree, in the wheel
 DEPTH_SOURCES = ("onnx", "npy", "png")
 DEPTH_PLUG_INS = "erfsfm_slam.depth"  # entry points of other packages: see docs/depth.md
 
@@ -249,15 +252,21 @@ def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str]
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.
     """
-    return load_sections(SlamConfig, file_or_name, overrides)
+    return _load(file_or_name, overrides)
 
 
 def load_stored(path: Path, *sections: str) -> SlamConfig:
     """Sections of the configuration that a run has kept; the others, which are not read, have their defaults.
 
-    A run of an earlier release may have keys that are gone: they are left out.
-
-    Raises:
-        ConfigError: one line that names the key or file, what came and what is allowed.
+    A run of an earlier release may have keys that are gone: they are left out. Raises as `load_config`.
     """
-    return load_sections(SlamConfig, path, (), sections)
+    return _load(path, (), sections)
+
+
+def _load(
+    file_or_name: str | Path | None, overrides: Sequence[str], sections: Collection[str] | None = None
+) -> SlamConfig:
+    try:
+        return load_tree(SlamConfig, file_or_name, overrides, _SHIPPED, sections)
+    except erfsfm.common.errors.ConfigError as error:
+        raise ConfigError(str(error)) from error

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from erfsfm.common.errors import explained
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import SlamConfig, dump_yaml
-from slam.evaluation.double_walls import double_wall_share
+from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from slam.results.metrics import Metrics
 from slam.results.output_folder import claim, stamped
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, trajectory_file
+from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, REPORT, trajectory_file
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import NOT_RECORDED
 
@@ -121,10 +122,17 @@ class RunFolder:
         return import_open3d().io.read_point_cloud(str(self.require(MAP_CLOUD)))
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        from slam.results.notebook import html
+        """What a notebook shows: errors, and the unit of lengths."""
+        from slam.results.tables import errors_table
 
-        return html(self)
+        metrics = self.metrics()
+        title = f"{metrics.sequence.name or self.path.name}: {metrics.sequence.frames or 0} frames"
+        errors = metrics.evaluated_errors()
+        notes = [note for note in (metrics.failure, *metrics.unit_notes()) if note]
+        if (self.path / REPORT).is_file():
+            notes.append(f"Report: {self.path / REPORT}")
+        table = errors_table(errors).html() if errors else ""
+        return f"<h4>{escape(title)}</h4>{table}" + "".join(f"<p>{escape(note)}</p>" for note in notes)
 
     def require(self, name: str) -> Path:
         """The path of a file of the run.

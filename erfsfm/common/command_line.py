@@ -16,6 +16,7 @@ from typing import NoReturn, TextIO
 
 import typer
 
+from erfsfm import __version__
 from erfsfm.common.errors import explained, shows_traceback
 from erfsfm.common.signals import Terminated
 
@@ -57,6 +58,26 @@ class Terminal(logging.StreamHandler[TextIO]):
             elif times > 1:
                 _say(f"WARNING {kind.partition(':')[0]}: {times - 1} more warnings of this kind")
         self._times.clear()
+
+
+def application(name: str, about: str) -> typer.Typer:
+    """A program of several verbs: plain help, since markup would lose what stands in brackets, and ``--version``."""
+    app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=about)
+
+    def print_version(wanted: bool) -> None:
+        if wanted:
+            typer.echo(f"{name} {__version__}")
+            raise typer.Exit
+
+    @app.callback()
+    def of_all_verbs(
+        version: bool = typer.Option(
+            False, "--version", callback=print_version, is_eager=True, help="print the version and exit"
+        ),
+    ) -> None:
+        pass
+
+    return app
 
 
 def run(app: Callable[..., object], name: str, level: int) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ConfigError
+from erfsfm.common.table import Table
 from erfsfm.config import Fidelity
 from erfsfm.networks.presets import PRESETS, build
 from erfsfm.networks.receptive_field import (
@@ -107,15 +108,16 @@ def measure_fields(
     return [_row(*which, snippet, offsets_px, learned, device) for which in wanted]
 
 
-def field_table(rows: Sequence[FieldRow]) -> str:
-    """The summaries of rows as text, a line each below a heading."""
-    lines = [f"{'network':32}{'theory':>9}{'columns x rows':>16}{'share':>8}{'all outputs':>13}{'95 % in':>9}  weights"]
+def field_table(rows: Sequence[FieldRow]) -> Table:
+    """The summaries of rows."""
+    texts = []
     for row in (row.summary() for row in rows):
         name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
+        ratios = (f"{row[key]:.1%}" for key in ("share", "share_of_all_outputs", "effective_share_95"))
         box = f"{row['columns']} x {row['rows']}"
-        ratios = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
-        lines.append(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{ratios}  {row['weights']}")
-    return "\n".join(lines)
+        texts.append([name, row["weights"], f"{row['theoretical_px']} px", box, *ratios])
+    head = ["network", "weights", "theory", "columns x rows", "share", "all outputs", "95 % in"]
+    return Table(head, texts, names=2)
 
 
 def _row(

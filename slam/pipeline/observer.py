@@ -117,8 +117,8 @@ class Observer:
         self._keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
         )
-        self._road = RoadHomography(config.road, intrinsics)
-        self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
+        self._road = RoadHomography(intrinsics)
+        self._plane = GroundPlaneFitter(intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
         self._snippet_frames: tuple[Frame, ...] = ()
         self._recent: tuple[FrameInWork, ...] = ()

@@ -16,7 +16,7 @@ from slam.loops.descriptors import FeatureExtractor
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, matches
 from slam.mapping.filters import KeyframeDepth
-from slam.results.report.rendering import Picture
+from slam.results.report.page import Picture
 
 _EXAMPLES, _MOST_LOOPS, _MOST_LINES = 5, 6, 60
 _WIDTH_PX = 480

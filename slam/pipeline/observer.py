@@ -11,7 +11,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from erfsfm.common.errors import COUNTED
 from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
 from slam.frontend.drive import Drive, Keyframe
@@ -314,7 +313,7 @@ class Observer:
         if is_se3(snippet.T_source_target):
             self._drive.snippets.append(snippet)
         else:
-            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE, extra=COUNTED)
+            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE)
 
     def _keep_rotation(self, rotation: Any) -> None:
         if rotation is not None:

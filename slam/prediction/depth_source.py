@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.errors import COUNTED
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
 from slam.runtime.errors import SlamError
 
@@ -72,7 +71,7 @@ class SourcedPredictor:
         self._unknown += [frame.index] if np.isnan(aligned.unit) else []
         self._is_known |= not np.isnan(aligned.unit)
         while self._is_known and self._unknown:  # else `snippet` refuses all of them
-            logger.warning("frame %d has no known depth in %s", self._unknown.pop(0), self._source.name, extra=COUNTED)
+            logger.warning("frame %d has no known depth in %s", self._unknown.pop(0), self._source.name)
         return aligned.depth
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:

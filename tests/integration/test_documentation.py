@@ -68,7 +68,6 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(python tools/benchmark.py .*)--frames \d+", r"\1--frames 32"),
     (r"--growth( \d+)+", "--growth 12 16"),
     (r"^(python tools/benchmark.py maps .*)--parts( '[^']+')+", r"\1--parts"),
-    (r"^(python tools/fit_step_noise.py) .*", r"\1 KITTI:05 KITTI:09 --weights sim"),
 )
 
 SLOW = (

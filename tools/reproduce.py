@@ -26,7 +26,7 @@ from shared.command import markdown, one_line_errors, parser_of
 
 from erfsfm.common.errors import ConfigError, TrainingError
 from erfsfm.common.files import write_atomically
-from erfsfm.common.progress import Progress, progress_bar, silent
+from erfsfm.common.progress import Progress, duration, progress_bar, silent
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.snippets import split_recordings
@@ -147,14 +147,13 @@ def tables(rows: Sequence[Row], results: dict[str, Results]) -> str:
 
 
 def _say_how_long(trainings: Sequence[Training], device: str) -> None:
-    hours = 0.0
+    total = 0.0
     for training in trainings:
         if steps := training.steps_left():
             seconds = training.seconds_a_step(device)
-            hours += seconds * steps / 3600
+            total += seconds * steps
             print(f"{training.name}: {steps} steps of {seconds:.3g} s", file=sys.stderr)
-    time_left = f"{hours / 24:.1f} days" if hours > 48 else f"{hours:.1f} hours"
-    print(f"all trainings: {time_left}, and what shrinking frames and evaluating takes", file=sys.stderr)
+    print(f"all trainings: {duration(round(total))}, and what shrinking frames and evaluating takes", file=sys.stderr)
 
 
 def _require_tested(kitti: Path, raw: Path | None, split: str) -> None:

@@ -45,10 +45,18 @@ def progress_lines(write: Callable[[str], object], every_s: float = 10.0) -> Ite
         said, left = now, ""
         if done > before:
             left_s = round((total - done) * (now - began) / (done - before))
-            left = f", {left_s // 60} min {left_s % 60} s left"
+            left = f", {duration(left_s)} left"
         write(f"{stage}: {done} of {total}{left}")
 
     yield update
+
+
+def duration(seconds: int) -> str:
+    """A time in words, to two units at most."""
+    minutes, hours = seconds // 60, seconds // 3600
+    if hours >= 48:
+        return f"{hours / 24:.1f} days"
+    return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {seconds % 60} s"
 
 
 @contextmanager

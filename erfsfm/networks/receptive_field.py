@@ -16,7 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from erfsfm.networks.blocks import Encoder, Layer
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.depth_net import DepthNet
-from erfsfm.networks.lite0_depth import Lite0DepthNet
+from erfsfm.networks.lite0 import Lite0DepthNet
 from erfsfm.networks.pose_net import PoseNet
 
 Network = DepthNet | PoseNet | Lite0DepthNet

@@ -12,7 +12,7 @@ from threading import Thread
 
 import numpy as np
 
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import calling_on_signals, raising_on_termination
 from erfsfm.inference import DepthPosePredictor
 from slam.commands.live.messages import Emit, corrected_message, pose_message

@@ -1,8 +1,7 @@
 """Reproduce the paper's tables: train what is missing, evaluate it, and write ours beside the paper's figures.
 
-The rows and the paper's figures are those of docs/design/reproduction.md; rows of one training share it. Frames are
-shrunk once for each size of images. The command says first how long it will take, by some steps of each training. It
-may be stopped, and goes on when it is repeated. Without --raw the columns of depth stay empty.
+The rows and the paper's figures are those of docs/design/reproduction.md. Frames are shrunk once for each size. The
+command says first how long it will take, by some steps of each training, and goes on where it was when it is repeated.
 
 Example: python tools/reproduce.py --kitti KITTI_ODOMETRY --raw KITTI_RAW --rows 'table1-*-416x128'
 """
@@ -33,6 +32,7 @@ from erfsfm.data.snippets import split_recordings
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.evaluation.protocols import named_recordings, pose_protocol
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.model_record import read_record
 from erfsfm.training.output_folder import OutputFolder
 from erfsfm.training.run import prepare, train
 
@@ -75,10 +75,9 @@ class Training:
         self.frames = output / "frames" / f"{self.config.network.width}x{self.config.network.height}"
 
     def steps_left(self) -> int:
-        """After its last checkpoint."""
-        folder = OutputFolder(self.folder)
-        done = folder.resumable_steps(self.config) if folder.checkpoint.is_file() else 0
-        return self.config.training.steps - done
+        """After its latest weights."""
+        record = self.folder / "last" / "model.yaml"
+        return self.config.training.steps - (read_record(record).step if record.is_file() else 0)
 
     def seconds_a_step(self, device: str) -> float:
         """Measured on frames that are shrunk, as those of the training."""
@@ -99,8 +98,8 @@ class Training:
         if not self.frames.is_dir():
             prepare(self.config, self.frames, progress)
         config = _changed(self.config, "data", roots=[self.frames])
-        begun = self.steps_left() < config.training.steps
-        train(config, self.folder, begun, device, shlex.join(sys.argv), progress)
+        resume = OutputFolder(self.folder).checkpoint.is_file()
+        train(config, self.folder, resume, device, shlex.join(sys.argv), progress)
 
     def evaluate(self, kitti: Path, raw: Path | None, split: str, device: str) -> Results:
         """Rows of snippets and of depth, kept in its folder; those of depth once there is ``raw``."""
@@ -149,7 +148,7 @@ def tables(rows: Sequence[Row], results: dict[str, Results]) -> str:
 def _say_how_long(trainings: Sequence[Training], device: str) -> None:
     total = 0.0
     for training in trainings:
-        if steps := training.steps_left():
+        if (steps := training.steps_left()) > 0:
             seconds = training.seconds_a_step(device)
             total += seconds * steps
             print(f"{training.name}: {steps} steps of {seconds:.3g} s", file=sys.stderr)
@@ -188,7 +187,7 @@ def main(words: Sequence[str] | None = None) -> None:
     results, text = {}, ""
     with progress_bar() as progress:
         for training in trainings:
-            if training.steps_left():
+            if training.steps_left() > 0:
                 training.run(options.device, progress)
             results[training.name] = training.evaluate(options.kitti, options.raw, options.split, options.device)
             text = tables(rows, results)

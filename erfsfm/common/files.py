@@ -65,7 +65,7 @@ def read_bytes(path: Path, most: int) -> bytes:
     """
     if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
         return content
-    raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
+    raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", str(path))
 
 
 def read_text(path: Path, encoding: str = "utf-8-sig", most: int = MAX_TEXT_BYTES) -> str:

@@ -55,8 +55,8 @@ def run(app: Callable[..., object], name: str, level: int) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     for variable, value in _OPENCV.items():
         os.environ.setdefault(variable, value)
-    if not (sys.warnoptions or shows_traceback()):
-        warnings.simplefilter("ignore")
+    if not shows_traceback():
+        _quieten_libraries()
     terminal = Terminal(level)
     # the shell leaves ~ in --output=~/runs
     words = [_HOME.sub(lambda match: f"{match[1] or ''}{Path.home()}", word) for word in sys.argv[1:]]
@@ -75,6 +75,16 @@ def run(app: Callable[..., object], name: str, level: int) -> None:
             raise
         _say(f"{name}: {explained(error)}")
         sys.exit(1)
+
+
+def _quieten_libraries() -> None:
+    """Only Python writes to standard error: what libraries in C say of a damaged file is said in our own line."""
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+    if sys.stderr is not None and sys.stderr is sys.__stderr__:
+        spoken = os.fdopen(os.dup(2), "w", 1, sys.stderr.encoding, sys.stderr.errors)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        sys.stderr = spoken
 
 
 def _say(line: str) -> None:

@@ -152,7 +152,7 @@ def _say_how_long(trainings: Sequence[Training], device: str) -> None:
             seconds = training.seconds_a_step(device)
             total += seconds * steps
             print(f"{training.name}: {steps} steps of {seconds:.3g} s", file=sys.stderr)
-    print(f"all trainings: {duration(round(total))}, and what shrinking frames and evaluating takes", file=sys.stderr)
+    print(f"all trainings: {duration(total)}, and what shrinking frames and evaluating takes", file=sys.stderr)
 
 
 def _require_tested(kitti: Path, raw: Path | None, split: str) -> None:

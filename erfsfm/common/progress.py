@@ -44,19 +44,19 @@ def progress_lines(write: Callable[[str], object], every_s: float = 10.0) -> Ite
             return
         said, left = now, ""
         if done > before:
-            left_s = round((total - done) * (now - began) / (done - before))
-            left = f", {duration(left_s)} left"
+            left = f", {duration((total - done) * (now - began) / (done - before))} left"
         write(f"{stage}: {done} of {total}{left}")
 
     yield update
 
 
-def duration(seconds: int) -> str:
-    """A time in words, to two units at most."""
-    minutes, hours = seconds // 60, seconds // 3600
-    if hours >= 48:
-        return f"{hours / 24:.1f} days"
-    return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {seconds % 60} s"
+def duration(seconds: float) -> str:
+    """As minutes and seconds, from two hours on in hours, from two days on in days."""
+    if seconds >= 2 * 86400:
+        return f"{seconds / 86400:.1f} days"
+    if seconds >= 2 * 3600:
+        return f"{seconds / 3600:.1f} hours"
+    return f"{round(seconds) // 60} min {round(seconds) % 60} s"
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The files of a simulated KITTI odometry root: images, depth maps, scans, surfaces, calibration and poses."""
+"""The worlds by their options, and their files as a KITTI odometry root."""
 
 import json
 import shutil
@@ -14,8 +14,19 @@ from numpy.typing import NDArray
 from slam.formats.ply import Ply, write_ply
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Float32Array, FloatArray
-from slam.simulation.options import VERSION
+from slam.simulation.options import VERSION, SimulationOptions
+from slam.simulation.rooms import SimulatedRooms
+from slam.simulation.street import SimulatedStreet
 from slam.simulation.world import SimulatedWorld
+
+
+def simulated_world(options: SimulationOptions) -> SimulatedWorld:
+    """The street or the rooms of these options.
+
+    Raises:
+        SequenceError: there are too few frames for the route.
+    """
+    return SimulatedRooms(options) if options.route == "rooms" else SimulatedStreet(options)
 
 
 def write_kitti_root(

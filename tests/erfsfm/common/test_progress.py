@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from erfsfm.common.progress import progress_bar, progress_lines
+from erfsfm.common.progress import duration, progress_bar, progress_lines
 
 
 def test_lines_say_what_is_done_and_the_time_left() -> None:
@@ -21,6 +21,11 @@ def test_lines_say_what_is_done_and_the_time_left() -> None:
             progress(stage, done, 100)
     assert lines[0] == "frames, 1: 1 of 100" and lines[2] == "loops: 0 of 100"
     assert re.fullmatch(r"frames, 2: 2 of 100, 0 min 1\d s left", lines[1])
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(68, "1 min 8 s"), (9000, "2.5 hours"), (420_000, "4.9 days")])
+def test_long_times_are_said_in_hours_and_days(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
 
 
 def test_short_work_is_quiet_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

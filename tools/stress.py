@@ -174,7 +174,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", help="A:B, of simulated worlds", default="840:846")
     parser.add_argument("--change", action="append", choices=list(CHANGES), help="default: every one; repeat")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--keep", type=Path, help="folder for the run folders, which fit_confidence.py reads")
+    parser.add_argument("--keep", type=Path, help="folder for the run folders")
     o = parser.parse_args(words)
     cameras: list[FrameSequence] = []
     if o.dataset is not None:

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
-from erfsfm.common.files import write_atomically
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from erfsfm.common.readers.camera_file import camera_of
+from erfsfm.common.readers.kitti_sensors import read_velodyne
 from erfsfm.common.readers.numbering import by_table
-from erfsfm.common.readers.scan import read_velodyne
 from slam.formats.trajectory import nearest_stamps
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray

@@ -18,8 +18,8 @@ import numpy as np
 
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.kitti_sensors import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles
-from erfsfm.common.readers.scan import read_velodyne
 from slam.formats.rows import BadRows, in_seconds, number_or_nan
 from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3

@@ -141,12 +141,6 @@ def read_values(path: Path) -> NDArray[Any]:
     return _decode(f"image {path}", data, cv2.IMREAD_UNCHANGED)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Height and width of an image file; raises as `read_image`."""
-    height, width = read_image(path).shape[:2]
-    return height, width
-
-
 def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:
     """The first readable image, and its place: of three, one of the size of most.
 

@@ -14,7 +14,7 @@ from typing import Any, Literal, TextIO
 
 import numpy as np
 
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import raising_on_termination
 from slam.commands.live.reader import EXPECTED, StreamedSequence, calibration_of
 from slam.commands.live.source import open_source

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from erfsfm.common.readers.kitti_oxts import VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP
+from erfsfm.common.readers.kitti_sensors import VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 

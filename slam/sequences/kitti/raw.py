@@ -20,7 +20,7 @@ from erfsfm.common.readers.kitti_calibration import (
     CalibrationFile,
 )
 from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, drive_name, find_drives
-from erfsfm.common.readers.kitti_oxts import read_packet
+from erfsfm.common.readers.kitti_sensors import read_packet
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
 from slam.frames import Intrinsics
 from slam.geometry import se3

@@ -244,7 +244,8 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
     rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line.strip())] for line in lines]
-    rows = rows[1:] if rows and np.isnan(rows[0]).all() else rows  # a header
+    has_header = files.rows_of(len(rows)) is None and files.rows_of(len(rows) - 1) is not None
+    rows = rows[has_header:]
     first, second = (np.array([row[k] if k < len(row) else np.nan for row in rows]) for k in (0, 1))
     is_numbered = np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()  # NaN is a name
     return require_stamps(second if is_numbered else first, path, files)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import Stretch, first_usual
 from slam.formats.rows import BadRows
@@ -31,7 +32,6 @@ from slam.sequences.ros.messages import (
     COMPRESSED_IMAGE,
     IMAGE,
     POINT_CLOUD,
-    SIXTEEN_BITS,
     camera_file_of,
     image_of,
     is_rectified,
@@ -155,14 +155,13 @@ class BagImages:
         return image_of(self.messages.read(index), self._where, self._stretch)
 
     def _common_stretch(self) -> Stretch | None:
-        """By some images; None where they have eight bits, or are compressed."""
+        """By some images; None where they have eight bits."""
         seen: list[NDArray[np.uint16]] = []
         for index in range(0, len(self), max(len(self) // _STRETCHED_BY, 1)):
-            message = self.messages.read(index)
-            if getattr(message, "encoding", "") not in SIXTEEN_BITS:
-                return None
-            with suppress(SequenceError):
-                seen.append(values_of(message, self._where))
+            with suppress(SequenceError, DataError):
+                seen.append(values_of(self.messages.read(index), self._where))
+                if seen[-1].dtype != np.uint16:
+                    return None
         return Stretch.of(seen) if seen else None
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
-from erfsfm.common.readers.images import Stretch, decode_image
+from erfsfm.common.readers.images import Stretch, decode_image, decode_values
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -56,11 +56,13 @@ def shows_pictures(message: Any, topic: str) -> bool:
 
 
 def values_of(message: Any, where: str) -> NDArray[Any]:
-    """The values ``(H, W, C)`` of an ``Image`` as stored.
+    """The values ``(H, W, C)`` of an ``Image`` as stored, or those of a ``CompressedImage``.
 
     Raises:
         SequenceError: an encoding that is not known, or too few bytes.
     """
+    if hasattr(message, "format"):
+        return decode_values(bytes(message.data), where)
     encoding = message.encoding
     if encoding not in _CONVERSIONS:
         raise SequenceError(f"{where} has encoding {encoding}; known are {', '.join(_CONVERSIONS)}")
@@ -113,7 +115,7 @@ def camera_file_of(
     fy, cy = (P[5], P[6]) if rectified else (K[4], K[5])
     if not (fx > 0 and fy > 0):
         raise SequenceError(f"{where} has no calibration, its focal length is {fx:g}: give --camera")
-    width, height, roi = info.width, info.height, info.roi
+    width, height, roi = info.width or (size or (0, 0))[0], info.height or (size or (0, 0))[1], info.roi
     if size != (width, height):
         binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)
         if roi.width and roi.height:

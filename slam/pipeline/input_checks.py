@@ -7,7 +7,7 @@ from slam.frames import Sequence
 from slam.frontend.lidar_odometry import has_scans
 from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
 from slam.runtime.errors import SlamError
-from slam.sequences.growing import GrowingSequence
+from slam.sequences.recording import GrowingSequence
 
 
 def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_gps: bool = False) -> None:

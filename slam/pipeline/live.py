@@ -29,8 +29,7 @@ from slam.runtime.run_files import MAP_MESH
 from slam.runtime.storage.record import Missing
 from slam.runtime.threads import Turns, in_turn
 from slam.runtime.timing import Stopwatch
-from slam.sequences.growing import GrowingSequence
-from slam.sequences.recording import POSSIBLE_PERIODS_S
+from slam.sequences.recording import POSSIBLE_PERIODS_S, GrowingSequence
 
 
 class Slam:

@@ -80,9 +80,7 @@ def _with_source(keys: Keys, program: str, fps: float) -> Keys:
 def lens_model(name: str | None) -> Literal["pinhole", "opencv", "fisheye"]:
     """The model of ``camera.yaml`` of a lens as another program names it; ``DataError`` where it is unknown."""
     if name not in LENSES:
-        raise DataError(
-            f"the lens model {name} is unknown: known are {', '.join(filter(None, LENSES))}; undistort the images, or give --camera"
-        )
+        raise DataError(f"the lens model {name} is unknown: known are {', '.join(filter(None, LENSES))}; give --camera")
     return LENSES[name]
 
 

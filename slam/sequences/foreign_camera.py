@@ -108,7 +108,7 @@ def _euroc(content: Keys) -> Keys:
         "model": lens_model(content.get("distortion_model")),
         "distortion": content.get("distortion_coefficients", []),
     }
-    return {**keys, **lens, "fps": content["rate_hz"]}
+    return {**keys, **lens, **({"fps": content["rate_hz"]} if "rate_hz" in content else {})}
 
 
 def _camera_info(content: Keys) -> Keys:
@@ -143,7 +143,7 @@ def _colmap(text: str) -> Keys:
 
 _PROGRAMS: dict[str, tuple[str, Callable[[Keys], Keys]]] = {
     "cam0": ("Kalibr", _kalibr),
-    "rate_hz": ("EuRoC", _euroc),
+    "resolution": ("EuRoC", _euroc),
     "camera_matrix": ("ROS", _camera_info),
     "Camera.fx": ("ORB-SLAM", _orb_slam),
     "Camera1.fx": ("ORB-SLAM", _orb_slam),

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import has_images, list_images
@@ -174,8 +175,8 @@ def _T_body_sensor(path: Path) -> FloatArray:
     """The pose of a sensor in the body ``(4, 4)`` by its ``sensor.yaml``."""
     try:
         T_body_sensor = np.array(read_opencv_yaml(path)["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError) as error:
-        raise SequenceError(f"{path} needs T_BS with data of 4 x 4 numbers: {error!r}") from error
+    except (OSError, KeyError, TypeError, ValueError, ErfsfmError) as error:
+        raise SequenceError(f"{path} needs T_BS with data of 4 x 4 numbers: {error}") from error
     if not se3.is_se3(T_body_sensor, _RIGID_TOLERANCE):
         raise SequenceError(f"{path} has a T_BS that is no rotation and translation: restore the file")
     return T_body_sensor

@@ -136,9 +136,13 @@ def read_values(path: Path) -> NDArray[Any]:
     Raises:
         DataError: missing, empty, truncated or no image; one line.
     """
-    data = _file_bytes(path)
-    _require_complete(data, f"image {path}")
-    return _decode(f"image {path}", data, cv2.IMREAD_UNCHANGED)
+    return decode_values(_file_bytes(path), f"image {path}")
+
+
+def decode_values(data: bytes, where: str) -> NDArray[Any]:
+    """As `read_values`, of the bytes of a file; ``where`` they come from is for messages."""
+    _require_complete(data, where)
+    return _decode(where, data, cv2.IMREAD_UNCHANGED)
 
 
 def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:

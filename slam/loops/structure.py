@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.geometry.triangulation import reprojection_errors, triangulate
 from slam.loops.places import Places
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import matches
+from slam.loops.verification import LoopThresholds, matches
 
 _NEIGHBOURS = 4  # places on either side that a place is matched with
 _LEAST_SIGHTINGS = 3

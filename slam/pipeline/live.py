@@ -17,7 +17,7 @@ from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
 from slam.loops.structure import PlaceStructure
-from slam.loops.thresholds import OF_KEYFRAMES
+from slam.loops.verification import OF_KEYFRAMES
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.live_poses import LivePose, LivePoses

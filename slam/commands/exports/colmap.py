@@ -16,7 +16,7 @@ from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places
 from slam.loops.structure import PlaceStructure
-from slam.loops.thresholds import OF_KEYFRAMES
+from slam.loops.verification import OF_KEYFRAMES
 from slam.results.folder import RunFolder
 from slam.runtime.run_files import PLACES
 

@@ -25,8 +25,7 @@ from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.structure import PlaceStructure
-from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
-from slam.loops.verification import matches
+from slam.loops.verification import OF_KEYFRAMES, LoopThresholds, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import CONFIG, PLACES

@@ -18,7 +18,7 @@ from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
-from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
+from slam.loops.verification import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate

@@ -67,11 +67,12 @@ class KeyframePoses:
         number = self.segments.get(first)
         if number is None or number != self.segments.get(last):
             return None
-        apart = self._T_map_camera[last][:3, 3] - self._T_map_camera[first][:3, 3]
+        apart = self.T_map_camera[last][:3, 3] - self.T_map_camera[first][:3, 3]
         return self.learned_units[number] * float(np.linalg.norm(apart))
 
     @cached_property
-    def _T_map_camera(self) -> dict[int, FloatArray]:
+    def T_map_camera(self) -> dict[int, FloatArray]:
+        """Poses of the frames in the first frame of each map, or of maps that turns link."""
         return chained(self.poses)
 
     def frames_of(self, segment: int) -> list[int]:

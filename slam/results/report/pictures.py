@@ -13,8 +13,7 @@ from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.residuals import Residuals
 from slam.geometry.se3 import invert
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import Loop, matches
+from slam.loops.verification import Loop, LoopThresholds, matches
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.rendering import Picture
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics, View
-from slam.geometry.resection import Resection
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.retrieval import PlaceIndex
-from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, matches
+from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches
 
 _PLACES_TRIED = 6
 # a single image has no points of its own that would confirm the pose, so it takes twice those of a loop
@@ -62,11 +61,11 @@ class Relocaliser:
     def locate(self, image: View) -> Relocalised | None:
         """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few."""
         keyframes, rows, points = self._matched(image)
-        best: Resection | None = None
+        best: Sighting | None = None
         for keyframe in np.unique(keyframes):
             here = keyframes == keyframe
             seen = self._verifier.resect(points[here].astype(np.float32), image.pixels[rows[here, 1]])
-            if isinstance(seen, Resection) and (best is None or len(seen.inliers) > len(best.inliers)):
+            if isinstance(seen, Sighting) and (best is None or len(seen.inliers) > len(best.inliers)):
                 best = seen
         if best is None:
             return None

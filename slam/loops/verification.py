@@ -6,7 +6,7 @@ All thresholds are independent of scale: pixels, ratios, degrees, and lengths ov
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
-from slam.geometry.resection import Resection, consensus, refine
+from slam.geometry.resection import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_angle
 from slam.loops.descriptors import hamming
 
@@ -141,6 +141,18 @@ class RejectedLoop:
         return replace(self, T_from_to=make(self.T_from_to[:3, :3], scale * self.T_from_to[:3, 3]))
 
 
+class Sighting(NamedTuple):
+    """Points seen by a camera: ``T_camera_points``, its ``sigmas`` ``(6,)``, rows of the ``inliers``.
+
+    ``depth`` is their median z-depth in the camera that measured them.
+    """
+
+    T_camera_points: FloatArray
+    sigmas: FloatArray
+    inliers: NDArray[np.intp]
+    depth: float
+
+
 class LoopVerifier:
     """Measures ``T_earlier_later`` between two views of one camera, in the unit of the points of the earlier one."""
 
@@ -174,7 +186,7 @@ class LoopVerifier:
         T_again[:3, 3] *= scale
         difference = forward.T_camera_points @ T_again
         rotation_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
-        depth = min(_depth(points_earlier, forward), scale * _depth(points_later, backward))
+        depth = min(forward.depth, scale * backward.depth)
         translation_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
         if rotation_deg > self.thresholds.agreement_deg or translation_ratio > self.thresholds.agreement_ratio:
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
@@ -185,7 +197,7 @@ class LoopVerifier:
         shared = np.union1d(forward.inliers, backward.inliers)
         return Loop(measured, inliers, score, scale, np.column_stack([rows_earlier[shared], rows_later[shared]]))
 
-    def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Resection | str:
+    def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
         """The camera that sees points ``(M, 3)``, NaN where unknown, at pixels ``(M, 2)``; or why not."""
         thresholds, K = self.thresholds, self._intrinsics.K
         known = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -193,13 +205,15 @@ class LoopVerifier:
         if len(known) < thresholds.min_inliers:
             return f"only {len(known)} matches have a trusted depth"
         start = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, thresholds.reprojection_px, self._seed)
-        count = 0 if start is None else len(start[2])
+        count = 0 if start is None else len(start[1])
         if start is None or count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(known):
             return f"only {count} of {len(known)} matches are inliers"
-        extent = pixels_known[start[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
+        T_start, inliers = start
+        extent = pixels_known[inliers].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
             return f"{count} inliers in a small part of the image"
-        return replace(refine(points_known, pixels_known, K, start), inliers=known[start[2]])
+        seen = resect([T_start], points_known[inliers], pixels_known[inliers], K)
+        return Sighting(seen.T_camera_world, seen.sigmas, known[inliers], float(np.median(points_known[inliers, 2])))
 
     def _sigmas(
         self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: FloatArray, backward: FloatArray
@@ -230,13 +244,8 @@ def matches(first: View, second: View, thresholds: LoopThresholds) -> tuple[NDAr
     return rows[kept], nearest[kept]
 
 
-def _depth(points: NDArray[np.float32], resection: Resection) -> float:
-    """Median z-depth of the inliers in the camera that measured them."""
-    return float(np.median(points[resection.inliers, 2].astype(np.float64)))
-
-
 def _scale(
-    points_first: NDArray[np.float32], points_second: NDArray[np.float32], forward: Resection, backward: Resection
+    points_first: NDArray[np.float32], points_second: NDArray[np.float32], forward: Sighting, backward: Sighting
 ) -> float | None:
     """The unit of the second view in that of the first, by the depths of points that both have."""
     both = np.intersect1d(forward.inliers, backward.inliers)

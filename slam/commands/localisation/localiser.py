@@ -18,9 +18,8 @@ from erfsfm.common.readers.images import list_images, read_image
 from erfsfm.common.readers.numbering import in_order
 from slam.config.sections import LoopsConfig, load_stored
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.frontend.keyframes.camera_pose import CameraPose, resect
-from slam.geometry.resection import consensus
-from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_matrix
+from slam.geometry.resection import Resection, consensus, resect
+from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
@@ -174,7 +173,7 @@ class Localiser:
     def _found(self, rows: list[int], view: View, learned: bool) -> _Pose | str:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
         starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
-        starts.sort(key=lambda start: len(start[2]), reverse=True)
+        starts.sort(key=lambda start: len(start[1]), reverse=True)
         found = [self._refined(start, rows, view, learned) for start in starts[:_STARTS]]
         if not found:
             return "no place has corners that fit one pose"
@@ -182,20 +181,20 @@ class Localiser:
         return max(poses, key=lambda pose: pose.inliers) if poses else found[0]
 
     def _refined(
-        self, start: tuple[FloatArray, FloatArray, NDArray[np.intp]], rows: list[int], view: View, learned: bool
+        self, start: tuple[FloatArray, NDArray[np.intp]], rows: list[int], view: View, learned: bool
     ) -> _Pose | str:
         """The pose by all corners of the map around a first one; or why it is none."""
-        T_camera_world = make(rotation_matrix(start[0]), start[1])
+        T_camera_world, _ = start
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
             if len(points) < self._thresholds.min_inliers:
                 return f"only {len(points)} corners agree"
-            pose = resect([T_camera_world], points, pixels, self._intrinsics)
+            pose = resect([T_camera_world], points, pixels, self._intrinsics.K)
             T_camera_world = pose.T_camera_world
         return self._accepted(pose, points)
 
-    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, FloatArray, NDArray[np.intp]] | None:
+    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]] | None:
         """The pose by one place, as `consensus` gives it."""
         corners, seen = matches(self._places.views[row], view, self._thresholds)
         points = self._structure.points(row, learned)[corners]
@@ -225,7 +224,7 @@ class Localiser:
         corners = np.flatnonzero(differing[np.arange(len(view)), best] <= _MOST_DIFFERING)
         return points[best[corners]], view.pixels[corners].astype(np.float64)
 
-    def _accepted(self, pose: CameraPose, points: FloatArray) -> _Pose | str:
+    def _accepted(self, pose: Resection, points: FloatArray) -> _Pose | str:
         """The pose, if enough corners agree and determine it."""
         inliers = pose.residual_px < self._thresholds.reprojection_px
         count = int(inliers.sum())

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA
-from slam.frontend.visual.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
 from slam.frontend.visual.two_view import CORNER_CORRELATION
+from slam.geometry.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
 from slam.geometry.se3 import FloatArray, make
 
 _INLIER_PX = 1.0

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
-from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.first_motion import first_motion
 from slam.frontend.keyframes.flow import flow, new_corners
@@ -25,7 +24,8 @@ from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
 from slam.frontend.sparse_flow import Pixels
-from slam.frontend.visual.epipolar import parallax_px
+from slam.geometry.epipolar import parallax_px
+from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
 
 logger = logging.getLogger(__name__)
@@ -235,7 +235,7 @@ class KeyframeOdometry:
         segment.frames.append(self._tracked(frame, track_ids, pixels))
         return True
 
-    def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
+    def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
         """From the last pose and from the predicted one; None with too few inliers."""
         if len(track_ids) < MIN_POINTS:
             return None
@@ -247,8 +247,8 @@ class KeyframeOdometry:
         spread = self._spread[np.searchsorted(segment.map.keyframes[-1].track_ids, track_ids)]
         before = np.isin(track_ids, segment.frames[-1].track_ids) if segment.frames else np.zeros(0, np.bool_)
         trusted = before if before.sum() >= MIN_POINTS else None
-        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread, trusted)
-        return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
+        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics.K, self._seed, spread, trusted)
+        return pose if len(pose.inliers) >= MIN_POINTS else None
 
     def _check_first_motion(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> None:
         """The best motion since the last keyframe, and its points, where these had no parallax before."""
@@ -281,7 +281,9 @@ class KeyframeOdometry:
             return 0.0
         R = self._state.T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
         rays_before = intrinsics.rays(last.pixels[np.searchsorted(last.track_ids, track_ids)])
-        parallax = parallax_px(rays_before, intrinsics.rays(pixels.astype(np.float64)), R, intrinsics)
+        parallax = parallax_px(
+            rays_before, intrinsics.rays(pixels.astype(np.float64)), R, (intrinsics.fx, intrinsics.fy)
+        )
         return float(np.median(parallax)) / intrinsics.width
 
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:

@@ -10,12 +10,12 @@ from itertools import pairwise
 import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
-from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.floor import units_by_floor
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment
 from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.visual.two_view import CORNER_CORRELATION
+from slam.geometry.resection import MIN_POINTS, resect
 from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_LENGTH = 1e-6
@@ -169,8 +169,8 @@ def _seen_from(
     known = local.known(track_ids)
     if known.sum() < MIN_POINTS:
         return None
-    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, seed)
-    if (pose.residual_px < INLIER_PX).sum() < MIN_POINTS or not np.isfinite(pose.sigmas).all():
+    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics.K, seed)
+    if len(pose.inliers) < MIN_POINTS or not np.isfinite(pose.sigmas).all():
         return None
     return pose.T_camera_world, CORNER_CORRELATION * pose.sigmas
 

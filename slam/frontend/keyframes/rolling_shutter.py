@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.frontend.sparse_flow import Pixels
-from slam.frontend.visual.epipolar import rotation_between
+from slam.geometry.epipolar import rotation_between
 from slam.geometry.se3 import FloatArray
 
 _Places = TypeVar("_Places", Pixels, FloatArray)

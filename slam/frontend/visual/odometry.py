@@ -18,14 +18,6 @@ from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, n
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
-from slam.frontend.visual.epipolar import (
-    UnitRelativePose,
-    depth_in_current,
-    parallax_px,
-    rotation_between,
-    triangulated_depth,
-    triangulated_nearness,
-)
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, pose_sigmas
 from slam.frontend.visual.motion_history import MotionHistory
@@ -43,7 +35,15 @@ from slam.frontend.visual.two_view import (
     TwoViewEstimator,
 )
 from slam.frontend.visual.working_size import WorkingSize
-from slam.geometry.resection import consensus, refine
+from slam.geometry.epipolar import (
+    UnitRelativePose,
+    depth_in_current,
+    parallax_px,
+    rotation_between,
+    triangulated_depth,
+    triangulated_nearness,
+)
+from slam.geometry.resection import consensus, resect
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
 
@@ -99,6 +99,7 @@ class VisualOdometry:
         self._config = config
         self._working = WorkingSize(intrinsics)
         self._intrinsics = intrinsics = self._working.camera
+        self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
         self._tracker = CornerTracker(config)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, seed)
@@ -253,7 +254,7 @@ class VisualOdometry:
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
         # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
-        unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._intrinsics)
+        unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._focal)
         if np.median(unexplained) < _MIN_PARALLAX_PX:
             return None
         history = self._state.history
@@ -310,7 +311,7 @@ class VisualOdometry:
         """The step with its length by learned depth, None with too few points for that."""
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         unit_pose = two_view.unit_pose
-        parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._intrinsics)
+        parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._focal)
         depth_previous = triangulated_depth(rays_previous, rays_current, unit_pose)
         solid = two_view.inliers & (depth_previous > 0) & (parallax > _MIN_POINT_PARALLAX_PX)
         measures = solid & np.isfinite(depth)
@@ -347,18 +348,19 @@ class VisualOdometry:
         corrected = self._state.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
-        found = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
-        count = 0 if found is None else len(found[2])
-        if found is None or count < max(self._config.min_inliers, _LEAST_PNP_SHARE * len(pixels)):
+        start = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
+        count = 0 if start is None else len(start[1])
+        if start is None or count < max(self._config.min_inliers, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
             return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
-        resection = refine(points_previous, pixels, K, found)
-        self._state = replace(self._state, fitted=tracks.track_ids[known][found[2]])
-        length = float(np.linalg.norm(resection.T_camera_points[:3, 3]))
+        T_start, inliers = start
+        resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
+        self._state = replace(self._state, fitted=tracks.track_ids[known][inliers])
+        length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
-        pose = RelativePose(*ends, invert(resection.T_camera_points), sigmas, PNP_SOURCE)
+        pose = RelativePose(*ends, invert(resection.T_camera_world), sigmas, PNP_SOURCE)
         return Motion(pose, support=count / tracks.sought)
 
 

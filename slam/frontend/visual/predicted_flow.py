@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics
 from slam.frontend.sparse_flow import Pixels
-from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.geometry.epipolar import UnitRelativePose
 
 _NEAREST = 1e-6
 _INVERSIONS = 2

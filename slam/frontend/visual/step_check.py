@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.frontend.visual.epipolar import triangulated_depth
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.visual.two_view import Matches, TwoViewEstimate
+from slam.geometry.epipolar import triangulated_depth
 
 # largest log of a length over the same by the road or by triangulated points
 _AGREEMENT = 0.25

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frontend.visual.epipolar import (
+from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
+from slam.frontend.visual.moving_regions import moving_corners
+from slam.frontend.visual.residuals import Residuals, tangent_of
+from slam.geometry.epipolar import (
     UnitRelativePose,
     triangulated_depth,
     unit_pose_by_essential,
     unit_pose_by_pnp,
 )
-from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
-from slam.frontend.visual.moving_regions import moving_corners
-from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry.robust import mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix
 

@@ -14,15 +14,14 @@ from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
 from slam.frontend.keyframes.descriptors import Descriptors
-from slam.frontend.keyframes.flow import flow
-from slam.frontend.sparse_flow import Pixels
+from slam.frontend.tracking import OF_KEYFRAMES, Pixels, track
 from slam.geometry.se3 import FloatArray, apply, invert
 
 TrackIds = NDArray[np.int64]
 
 _IMAGES_KEPT = 20
 _LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
-_MATCHED_LEVELS = 1
+_MATCHED = OF_KEYFRAMES._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
 _SHARED = 5
@@ -299,4 +298,4 @@ def _matched(
     turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
     pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-    return flow(turned, grey, pixels, guesses, _MATCHED_LEVELS)
+    return track(turned, grey, pixels, _MATCHED, guesses)

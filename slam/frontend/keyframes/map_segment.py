@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from slam.frames import RelativePose
 from slam.frontend.keyframes.local_map import LocalMap, TrackIds
-from slam.frontend.sparse_flow import Pixels
+from slam.frontend.tracking import Pixels
 from slam.geometry.se3 import FloatArray
 
 

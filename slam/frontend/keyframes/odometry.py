@@ -18,12 +18,11 @@ from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.first_motion import first_motion
-from slam.frontend.keyframes.flow import flow, new_corners
 from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, small_image, turned
 from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
 from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
-from slam.frontend.sparse_flow import Pixels
+from slam.frontend.tracking import OF_KEYFRAMES, Pixels, new_corners, track
 from slam.geometry.epipolar import parallax_px
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
@@ -35,7 +34,6 @@ _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 _LEAST_CORRELATION, _SURE_CORRELATION = 0.4, 0.8  # of turned images, for a guess, and for a measurement
-_PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
@@ -202,16 +200,11 @@ class KeyframeOdometry:
         guesses = state.places[rows]
         if turn is not None and turn.correlation > _LEAST_CORRELATION:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
-        found, kept = flow(
-            keyframe.grey,
-            frame.grey,
-            keyframe.places[rows].astype(np.float32),
-            guesses,
-            _PYRAMID_LEVELS,
-        )
-        shift = np.median(found[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
-        state.places[rows] = np.where(kept[:, None], found, guesses + shift)
-        return keyframe.track_ids[rows[kept]], found[kept]
+        corners = keyframe.places[rows].astype(np.float32)
+        tracked, kept = track(keyframe.grey, frame.grey, corners, OF_KEYFRAMES, guesses)
+        shift = np.median(tracked[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
+        state.places[rows] = np.where(kept[:, None], tracked, guesses + shift)
+        return keyframe.track_ids[rows[kept]], tracked[kept]
 
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
         """The camera's pose from known points; whether there are enough."""

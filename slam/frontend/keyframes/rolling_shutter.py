@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.sparse_flow import Pixels
+from slam.frontend.tracking import Pixels
 from slam.geometry.epipolar import rotation_between
 from slam.geometry.se3 import FloatArray
 

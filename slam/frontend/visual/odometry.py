@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, nearest_depth, trusted_depth
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.focal_length import FocalLength
@@ -24,7 +25,6 @@ from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.visual.step_check import Step, most_credible
-from slam.frontend.visual.tracking import CornerTracker, Tracks
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,

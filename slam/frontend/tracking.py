@@ -30,9 +30,9 @@ _TILES = 3, 4  # down and across: corners are spread over them
 class Search(NamedTuple):
     """A search by windows of ``side`` pixels over ``levels`` of the image pyramid above the full image.
 
-    ``limits`` are most iterations, and the shift in pixels below which they end; the search ``back`` has its own levels
-    and limits, and begins where corners came from; without them it is as the search, and begins where corners were found. A corner
-    is kept if it returns to within ``error_px`` along both axes.
+    ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept if a search ``back``
+    returns to within ``error_px`` along both axes. That has its own levels and limits and begins where corners came
+    from; without them it is the same search, and begins where they were found.
     """
 
     side: int

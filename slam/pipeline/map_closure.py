@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
 from slam.frontend.keyframes.joining import SharedCorners, join
-from slam.frontend.keyframes.local_map import TrackedKeyframe
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.scale.metric_scale import Scale

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from slam.frames import TrackingEvent
 from slam.frontend.drive import Drive
 from slam.frontend.image_gate import GateState
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.visual.odometry import OdometryState
 
 

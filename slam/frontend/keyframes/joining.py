@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, MapSegment, TrackedFrame, TrackedKeyframe, TrackIds
 from slam.geometry.se3 import FloatArray, apply, invert
 
 logger = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
+from slam.frames import DepthMap, Grey, Intrinsics, RelativePose, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
 from slam.frontend.keyframes.descriptors import Descriptors
@@ -279,6 +279,33 @@ class LocalMap:
         near = np.flatnonzero((distance < _NEAR_DEPTHS) & (cosine > _NEAR_COSINE))
         order = np.argsort((distance + 2.0 * (1.0 - cosine))[near], kind="stable")
         return [kept[k] for k in near[order]]
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost."""
+
+    index: int
+    track_ids: TrackIds
+    pixels: Pixels
+    T_camera_world: FloatArray | None
+
+
+@dataclass
+class MapSegment:
+    """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points.
+
+    ``turns`` are motions of the camera where no point carries the unit, in the unit of learned depth.
+    """
+
+    map: LocalMap = field(default_factory=LocalMap)
+    frames: list[TrackedFrame] = field(default_factory=list)
+    started: bool = False
+    turns: list[RelativePose] = field(default_factory=list)
+
+    def copy(self) -> MapSegment:
+        """A snapshot, which stays while this map grows."""
+        return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())
 
 
 def _matched(

@@ -18,10 +18,17 @@ from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.first_motion import first_motion
-from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, small_image, turned
-from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
-from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
+from slam.frontend.keyframes.image_turn import (
+    ImageTurn,
+    SmallImage,
+    image_shift,
+    image_turn,
+    in_middle_row,
+    measured_turn,
+    small_image,
+    turned,
+)
+from slam.frontend.keyframes.local_map import MapSegment, TrackedFrame, TrackedKeyframe, TrackIds
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, new_corners, track
 from slam.geometry.epipolar import parallax_px
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect

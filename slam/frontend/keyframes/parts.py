@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
 from slam.frontend.keyframes.depth_prior import Parallax
 from slam.frontend.keyframes.joining import moved
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.unit import learned_units
 from slam.geometry.resection import MIN_POINTS
 from slam.geometry.se3 import FloatArray, chain, invert

@@ -84,6 +84,25 @@ class Motion:
         )
 
 
+@dataclass(frozen=True)
+class RelativeRotation:
+    """The rotation from one frame to another some steps later, measured on these two images alone.
+
+    ``R_to_from`` ``(3, 3)`` takes points of the earlier camera to the axes of the later one; ``sigmas`` ``(3,)`` are
+    those of its rotation vector in the later camera, radians.
+    """
+
+    from_index: int
+    to_index: int
+    R_to_from: FloatArray
+    sigmas: FloatArray
+
+    @property
+    def ends(self) -> Ends:
+        """Both frames."""
+        return self.from_index, self.to_index
+
+
 def pose_sigmas(
     T_previous_current: FloatArray, rotation: FloatArray, direction: FloatArray, length_relative_sigma: float
 ) -> FloatArray:

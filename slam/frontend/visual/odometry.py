@@ -10,22 +10,32 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, nearest_depth, trusted_depth
+from slam.frames import (
+    DepthMap,
+    Ends,
+    Frame,
+    Image,
+    Intrinsics,
+    Mask,
+    RelativePose,
+    nearest_depth,
+    resized_depth,
+    trusted_depth,
+)
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.focal_length import FocalLength
-from slam.frontend.visual.motion import Motion, pose_sigmas
+from slam.frontend.visual.motion import Motion, RelativeRotation, pose_sigmas
 from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.moving_regions import DynamicMask
 from slam.frontend.visual.predicted_flow import PredictedFlow
-from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.frontend.visual.step_check import Step, most_credible
-from slam.frontend.visual.triangulated_points import TriangulatedPoints
+from slam.frontend.visual.step_check import Step, TriangulatedPoints, most_credible
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
     DEPTH_RELATIVE_SIGMA,
@@ -34,7 +44,6 @@ from slam.frontend.visual.two_view import (
     TwoViewEstimate,
     TwoViewEstimator,
 )
-from slam.frontend.visual.working_size import WorkingSize
 from slam.geometry.epipolar import (
     UnitRelativePose,
     depth_in_current,
@@ -65,6 +74,9 @@ _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stand
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
 _ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
+# corners are measured in images of a megapixel at most: larger ones are no sharper, a pixel of theirs has more noise and
+# less contrast, corners crowd on few objects, and the time grows with the pixels
+_MOST_PIXELS = 1e6
 _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degrees
 
 
@@ -362,6 +374,30 @@ class VisualOdometry:
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
         pose = RelativePose(*ends, invert(resection.T_camera_world), sigmas, PNP_SOURCE)
         return Motion(pose, support=count / tracks.sought)
+
+
+class WorkingSize:
+    """Reduces images and depth of one camera; those of at most a megapixel stay as they are."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        """``camera`` is that of the reduced images."""
+        ratio = float(np.sqrt(_MOST_PIXELS / (intrinsics.width * intrinsics.height)))
+        size = round(ratio * intrinsics.width), round(ratio * intrinsics.height)
+        self.camera = intrinsics if ratio >= 1.0 else intrinsics.resized(*size)
+        self._size = self.camera.width, self.camera.height
+
+    def frame(self, frame: Frame) -> Frame:
+        """The frame with its reduced image."""
+
+        def reduced() -> Frame:
+            image: Image = np.asarray(cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8)
+            return Frame(frame.index, frame.stamp, image)
+
+        return frame if frame.image.shape[1::-1] == self._size else frame.derived(("reduced", self._size), reduced)
+
+    def depth(self, depth: DepthMap) -> DepthMap:
+        """The depth map ``(h, w)`` of the reduced image."""
+        return depth if depth.shape[::-1] == self._size else resized_depth(depth, *self._size)
 
 
 def _with_floors(two_view: TwoViewEstimate) -> FloatArray:

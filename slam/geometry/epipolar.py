@@ -105,10 +105,10 @@ def unit_pose_by_pnp(
     if known.sum() < _LEAST_POINTS:
         return None
     points = rays_previous[known] * depth_previous[known, None]
-    found = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
-    if found is None:
+    pose = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
+    if pose is None:
         return None
-    T_current_previous, _ = found
+    T_current_previous, _ = pose
     length = float(np.linalg.norm(T_current_previous[:3, 3]))
     return UnitRelativePose(T_current_previous[:3, :3], T_current_previous[:3, 3] / length) if length > 0 else None
 

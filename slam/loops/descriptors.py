@@ -44,9 +44,9 @@ class FeatureExtractor:
 
     def corners(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
-        found = self._orb.detect(grey, None)
-        strongest = _strongest_per_cell(found, grey.shape, _MAX_FEATURES)
-        chosen, descriptors = self._orb.compute(grey, [found[k] for k in strongest])
+        detected = self._orb.detect(grey, None)
+        strongest = _strongest_per_cell(detected, grey.shape, _MAX_FEATURES)
+        chosen, descriptors = self._orb.compute(grey, [detected[k] for k in strongest])
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
         return np.array([keypoint.pt for keypoint in chosen], np.float32), descriptors

@@ -92,12 +92,12 @@ class PlaceStructure:
 
     def _triangulated_around(self, row: int) -> Tracks:
         """A point for each corner of a place, by the places around it."""
-        place, found = self._places.views[row], []
+        place, pairings = self._places.views[row], []
         for other in range(max(0, row - _NEIGHBOURS), min(len(self._places.views), row + _NEIGHBOURS + 1)):
             own = np.arange(len(place))
             pairs = (own, own) if other == row else matches(place, self._places.views[other], self._thresholds)
-            found.append((np.full(len(pairs[0]), other), *pairs))
-        views, corners, seen = (np.concatenate(column) for column in zip(*found, strict=True))
+            pairings.append((np.full(len(pairs[0]), other), *pairs))
+        views, corners, seen = (np.concatenate(column) for column in zip(*pairings, strict=True))
         return self._triangulated(views, seen, corners, len(place))
 
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:

@@ -70,11 +70,11 @@ def image_turn(
         pairs.insert(0, (*coarse, scale / _COARSE))
     yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
     R_shift = rotation_matrix(np.array([-pitch, yaw, 0.0]))
-    found = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
+    turns = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
     for first, second, each in pairs:
         problem = _Alignment(first, second, intrinsics, each)
-        found = [max((problem.solve(turn.R_now_before) for turn in found), key=lambda turn: turn.correlation)]
-    return found[0]
+        turns = [max((problem.solve(turn.R_now_before) for turn in turns), key=lambda turn: turn.correlation)]
+    return turns[0]
 
 
 class _Alignment:

@@ -116,10 +116,10 @@ class LocalMap:
         return self._parallax(self.keyframes if last is None else self.keyframes[-last:])
 
     def _parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
-        found = Parallax(self.points)
+        parallax = Parallax(self.points)
         for keyframe in keyframes:
-            found.see(keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)])
-        return found
+            parallax.see(keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)])
+        return parallax
 
     def add_points(self, intrinsics: Intrinsics) -> None:
         """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map."""
@@ -228,9 +228,9 @@ class LocalMap:
             a, b = a[pending[b]], b[pending[b]]
             if len(a) < _LEAST_MATCHED:
                 continue
-            found, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics)
-            kept &= np.linalg.norm(found - pixels[b], axis=1) < _ALIGNED_PX
-            pixels[b[kept]] = found[kept]
+            matched, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics)
+            kept &= np.linalg.norm(matched - pixels[b], axis=1) < _ALIGNED_PX
+            pixels[b[kept]] = matched[kept]
             pending[b[kept]] = False
         return pixels
 
@@ -252,10 +252,10 @@ class LocalMap:
             rows, projected = rows[inside], projected[inside]
             if len(rows) < _LEAST_MATCHED:
                 continue
-            found, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics)
-            kept &= np.linalg.norm(found - projected, axis=1) < _PROJECTED_PX
+            matched, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics)
+            kept &= np.linalg.norm(matched - projected, axis=1) < _PROJECTED_PX
             tracks.append(keyframe.track_ids[rows[kept]])
-            places.append(found[kept])
+            places.append(matched[kept])
             attempts[keyframe.track_ids[rows]] -= 1
             attempts[tracks[-1]] = 0
             misses = misses + 1 if kept.sum() < _LEAST_FOUND * len(rows) else 0

@@ -293,8 +293,8 @@ class KeyframeOdometry:
         T, is_tracked = state.T_camera_world, len(track_ids) > 0
         if is_tracked:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
-            again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
-            track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
+            again, reprojected = local.found_again(frame.grey, T, track_ids, intrinsics)
+            track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels))
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])

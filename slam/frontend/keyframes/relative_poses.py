@@ -97,9 +97,9 @@ def keyframe_poses(
     maps = [segment for segment in maps if segment.started]
     learned = [learned_unit(segment.map) for segment in maps]
     for number, segment in enumerate(maps):
-        found = _segment_poses(segment, intrinsics, seed)
-        poses += found
-        segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
+        located = _segment_poses(segment, intrinsics, seed)
+        poses += located
+        segments |= dict.fromkeys((frame for pose in located for frame in pose.ends), number)
         turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
     outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
@@ -120,11 +120,11 @@ def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
 def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
     local, keyframes = segment.map, segment.map.keyframes
     place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
-    found: list[RelativePose] = []
+    poses: list[RelativePose] = []
     for before, after in pairwise(keyframes):
         seen = _seen_from(local, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed)
         sigmas = None if seen is None else seen[1]
-        found.append(_relative(before, after.index, after.T_camera_world, sigmas))
+        poses.append(_relative(before, after.index, after.T_camera_world, sigmas))
     T_guess = keyframes[0].T_camera_world
     for frame in segment.frames:
         if frame.index in place:
@@ -136,14 +136,14 @@ def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> li
         if located is not None:
             T_guess, sigmas = located
             nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
-            found.append(_relative(nearest, frame.index, T_guess, sigmas))
-    return found
+            poses.append(_relative(nearest, frame.index, T_guess, sigmas))
+    return poses
 
 
 def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, seed: int) -> dict[Ends, RelativePose]:
     """Between keyframes of this map, their sigmas by the points that both see."""
     keyframes = {keyframe.index: keyframe for keyframe in local.keyframes}
-    found = {}
+    closing = {}
     for first, last in loops:
         if first not in keyframes or last not in keyframes:
             continue
@@ -152,8 +152,8 @@ def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, 
         T = after.T_camera_world
         seen = _seen_from(local, after.track_ids[both], after.pixels[both], T, intrinsics, seed)
         pose = _relative(before, last, T, None if seen is None else seen[1])
-        found[first, last] = replace(pose, source=LOOP_SOURCE)
-    return found
+        closing[first, last] = replace(pose, source=LOOP_SOURCE)
+    return closing
 
 
 def _seen_from(

@@ -74,8 +74,8 @@ _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stand
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
 _ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
-# corners are measured in images of a megapixel at most: larger ones are no sharper, a pixel of theirs has more noise and
-# less contrast, corners crowd on few objects, and the time grows with the pixels
+# corners are measured in images of a megapixel at most: larger ones are no sharper, their pixels have more noise and
+# less contrast, corners crowd on few objects, and the time grows with them
 _MOST_PIXELS = 1e6
 _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degrees
 
@@ -202,11 +202,11 @@ class VisualOdometry:
                 return None
             votes, learned = np.ones(len(tracks), dtype=bool), nearest_depth(depth_first_unscaled, tracks.previous)
             matches = self._matches(tracks, votes, learned, None, mask, error)
-            found = self._two_views.refined(matches, known[0])
-            if found is None or found.inliers.sum() < self._config.min_inliers:
+            estimate = self._two_views.refined(matches, known[0])
+            if estimate is None or estimate.inliers.sum() < self._config.min_inliers:
                 return None
-            sigmas = np.sqrt(np.diag(found.covariance)[:3])
-            return RelativeRotation(first.index, last.index, found.unit_pose.R_current_previous, sigmas)
+            sigmas = np.sqrt(np.diag(estimate.covariance)[:3])
+            return RelativeRotation(first.index, last.index, estimate.unit_pose.R_current_previous, sigmas)
 
         return measure
 

@@ -83,10 +83,10 @@ def most_credible(
     history: MotionHistory,
 ) -> Step | None:
     """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
-    found = [step for step in steps if step is not None]
-    balance = [sum(_votes(step, matches, height_unscaled, seconds, history)) for step in found]
+    estimated = [step for step in steps if step is not None]
+    balance = [sum(_votes(step, matches, height_unscaled, seconds, history)) for step in estimated]
     best = int(np.argmax(balance))
-    return found[best] if balance[best] >= 0 else None
+    return estimated[best] if balance[best] >= 0 else None
 
 
 def _votes(

@@ -121,10 +121,10 @@ class TwoViewEstimator:
         candidates = [usual, best]
         if best is None or best.agreeing[votes].mean() < least:
             candidates.append(self._refined(matches, by_points(), prior))
-        found = [candidate for candidate in candidates if candidate is not None]
-        if not found:
+        estimates = [candidate for candidate in candidates if candidate is not None]
+        if not estimates:
             return None
-        return max(found, key=lambda candidate: _support(candidate, votes, prior))
+        return max(estimates, key=lambda candidate: _support(candidate, votes, prior))
 
     def refined(self, matches: Matches, start: UnitRelativePose) -> TwoViewEstimate | None:
         """The motion refined from a well-known ``start``.

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
-from slam.frontend.keyframes.joining import SharedCorners, join
+from slam.frontend.keyframes.joining import join
 from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.unit import learned_unit
@@ -217,7 +217,7 @@ def _joined(
     for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
         sigmas = np.append(loop.measured.sigmas, _LOOP_SCALE_SIGMA)
         edges.append(RelativeSimilarity(earlier, later, loop.measured.T_from_to, loop.scale, sigmas))
-        shared.append(SharedCorners(earlier, later, loop.corners))
+        shared.append((earlier, later, loop.corners))
     T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
     return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)
 

@@ -101,9 +101,9 @@ def _check(content: dict[str, NDArray[Any]]) -> None:
     """Refuse arrays that do not belong together, with a ``ValueError``."""
     sizes: dict[int | str, int] = {"V": len(content["frames"]), "M": int(content["counts"].sum())}
     for name, (kind, shape) in _ARRAYS.items():
-        array, wanted = content[name], tuple(sizes.get(side, side) for side in shape)
-        if array.dtype.kind != kind or array.shape != wanted:
-            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {wanted}")
+        array, expected = content[name], tuple(sizes.get(side, side) for side in shape)
+        if array.dtype.kind != kind or array.shape != expected:
+            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {expected}")
     if (content["counts"] < 0).any() or (np.diff(content["frames"], prepend=-1) <= 0).any():
         raise ValueError("frames do not increase, or a count is negative")
     T_world_camera = content["T_world_camera"]

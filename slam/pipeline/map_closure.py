@@ -141,7 +141,7 @@ class _Rows:
         """Which keyframes share few tracks ``(K, K)``."""
         first = np.cumsum([0, *(len(segment.map.points) for segment in self.segments)])
         tracks = [k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)]
-        of_row = np.repeat(np.arange(len(tracks)), [len(each) for each in tracks])
+        of_row = np.repeat(np.arange(len(tracks)), [len(of_keyframe) for of_keyframe in tracks])
         shape = len(tracks), int(first[-1])
         seen = csr_array((np.ones(len(of_row)), (of_row, np.concatenate(tracks))), shape=shape)
         return np.asarray((seen @ seen.T).toarray() < _CONNECTED)

@@ -63,6 +63,6 @@ def first_motion(
     )
     problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]), Noise())
     solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_LIMITS) for T, z in starts]
-    costs = np.array([each.cost for each in solved])
+    costs = np.array([adjusted.cost for adjusted in solved])
     best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
     return best.T_camera_world[1], best.points[:, 2]

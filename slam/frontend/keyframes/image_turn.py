@@ -66,13 +66,13 @@ def image_turn(
     pairs = [(before, now, scale)]
     if min(now.shape) >= 2 * _COARSE * _SMOOTH_PX:
         size = now.shape[1] // _COARSE, now.shape[0] // _COARSE
-        coarse = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (before, now))
+        coarse = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (before, now))
         pairs.insert(0, (*coarse, scale / _COARSE))
     yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
     R_shift = rotation_matrix(np.array([-pitch, yaw, 0.0]))
     turns = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
-    for first, second, each in pairs:
-        problem = _Alignment(first, second, intrinsics, each)
+    for first, second, size_ratio in pairs:
+        problem = _Alignment(first, second, intrinsics, size_ratio)
         turns = [max((problem.solve(turn.R_now_before) for turn in turns), key=lambda turn: turn.correlation)]
     return turns[0]
 

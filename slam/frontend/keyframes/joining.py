@@ -70,8 +70,8 @@ def moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -
     before = segment.map
     points = np.full_like(before.points, np.nan)
     for keyframe, T, scale in reversed(list(zip(before.keyframes, T_world_camera, scales, strict=True))):
-        own = apply(keyframe.T_camera_world, before.points[keyframe.track_ids])
-        points[keyframe.track_ids] = apply(T, scale * own)
+        points_camera = apply(keyframe.T_camera_world, before.points[keyframe.track_ids])
+        points[keyframe.track_ids] = apply(T, scale * points_camera)
     T_camera_world = invert(T_world_camera)
     keyframes = [replace(k, T_camera_world=T) for k, T in zip(before.keyframes, T_camera_world, strict=True)]
     indices = np.array([keyframe.index for keyframe in keyframes])

@@ -181,8 +181,8 @@ def _relative(
     T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
     length = float(np.linalg.norm(T_from_to[:3, 3]))
     floors = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3)
-    own = 10.0 * floors if sigmas is None else sigmas
-    return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), KEYFRAME_SOURCE)
+    by_points = 10.0 * floors if sigmas is None else sigmas
+    return RelativePose(keyframe.index, index, T_from_to, np.hypot(by_points, floors), KEYFRAME_SOURCE)
 
 
 def chained(poses: Sequence[RelativePose]) -> dict[int, FloatArray]:

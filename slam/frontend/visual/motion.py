@@ -71,10 +71,10 @@ class Motion:
             relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
             noise: of rotation and direction, added in squares to that of the corners.
         """
-        own = self.own_noise
+        corners = self.own_noise
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / self.length_unscaled
-        rotation, direction = np.hypot(own.rotation, noise.rotation), np.hypot(own.direction, noise.direction)
+        rotation, direction = np.hypot(corners.rotation, noise.rotation), np.hypot(corners.direction, noise.direction)
         sigmas, correlated_sigmas = (
             pose_sigmas(T_previous_current, rotation, direction, sigma)
             for sigma in (relative_sigma, relative_correlated_sigma)

@@ -219,8 +219,8 @@ class TwoViewEstimator:
         residuals = self._residuals(matches)
         ratios = [self._ratios(matches, motion, residuals)[0] for motion in motions if motion is not None]
         least = max(_LEAST_POINTS, _COMPARABLE_SUPPORT * max(map(len, ratios), default=0))
-        logarithms = [np.log(each) for each in ratios if len(each) >= least]
-        error = min((mad_sigma(each - np.median(each)) for each in logarithms), default=0.0)
+        logarithms = [np.log(of_motion) for of_motion in ratios if len(of_motion) >= least]
+        error = min((mad_sigma(logarithm - np.median(logarithm)) for logarithm in logarithms), default=0.0)
         return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
 
     def _length(self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals) -> float | None:

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Grey, Intrinsics, RelativePose, nearest_depth
+from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
-from slam.frontend.keyframes.descriptors import Descriptors
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, track
 from slam.geometry.se3 import FloatArray, apply, invert
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
-from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.first_motion import first_motion
 from slam.frontend.keyframes.image_turn import (
     ImageTurn,
@@ -32,6 +31,7 @@ from slam.frontend.tracking import OF_KEYFRAMES, Pixels, new_corners, track
 from slam.geometry.epipolar import parallax_px
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
+from slam.loops.descriptors import describe
 
 logger = logging.getLogger(__name__)
 

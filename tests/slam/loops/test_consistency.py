@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slam.config.sections import LoopsConfig
@@ -47,3 +49,15 @@ def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:
     far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
     kept, refused = agreeing(far, Track.of_drive(ring()), THRESHOLDS)
     assert kept == [] and all("corrects the odometry by more than 30% of" in r.reason for r in refused)
+
+
+def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> None:
+    """Two maps of one drive: where odometry relates them, a loop is bound by it, else by other loops alone."""
+    track = Track.of_drive(ring())
+    maps = (track.frames >= 150).astype(np.intp)
+    far = [loop(k, 200 + k, ring(), shift=-90.0, inliers=300) for k in range(0, 40, 4)]
+    kept, refused = agreeing(far, replace(track, maps=maps), THRESHOLDS)
+    assert kept == [] and all("corrects the odometry" in r.reason for r in refused)
+    unsure = track.path + 300.0 * maps
+    assert len(agreeing(far, replace(track, maps=maps, path=unsure), THRESHOLDS)[0]) == 10
+    assert len(agreeing(far, replace(track, maps=maps, worlds=maps), THRESHOLDS)[0]) == 10

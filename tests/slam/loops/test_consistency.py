@@ -55,9 +55,9 @@ def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> Non
     """Two maps of one drive: where odometry relates them, a loop is bound by it, else by other loops alone."""
     track = Track.of_drive(ring())
     maps = (track.frames >= 150).astype(np.intp)
-    far = [loop(k, 200 + k, ring(), shift=-90.0, inliers=300) for k in range(0, 40, 4)]
-    kept, refused = agreeing(far, replace(track, maps=maps), THRESHOLDS)
-    assert kept == [] and all("corrects the odometry" in r.reason for r in refused)
+    far = [loop(5, 205, ring(), shift=-90.0, inliers=300)]
+    kept, (refused,) = agreeing(far, replace(track, maps=maps), THRESHOLDS)
+    assert kept == [] and "corrects the odometry" in refused.reason
     unsure = track.path + 300.0 * maps
-    assert len(agreeing(far, replace(track, maps=maps, path=unsure), THRESHOLDS)[0]) == 10
-    assert len(agreeing(far, replace(track, maps=maps, worlds=maps), THRESHOLDS)[0]) == 10
+    assert len(agreeing(far, replace(track, maps=maps, path=unsure), THRESHOLDS)[0]) == 1
+    assert len(agreeing(far, replace(track, maps=maps, worlds=maps), THRESHOLDS)[0]) == 1

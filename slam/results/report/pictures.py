@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Image, Intrinsics, View
-from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.residuals import Residuals
+from slam.geometry.epipolar import UnitRelativePose
 from slam.geometry.se3 import invert
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import Loop, matches
+from slam.loops.verification import Loop, LoopThresholds, matches
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.page import Picture
 

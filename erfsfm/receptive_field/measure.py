@@ -14,8 +14,8 @@ from torch import Tensor
 
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ConfigError
-from erfsfm.common.table import Table
 from erfsfm.common.readers.kitti_calibration import CAMERA_HEIGHT_M
+from erfsfm.common.table import Table
 from erfsfm.config import Fidelity
 from erfsfm.networks.presets import PRESETS, build
 from erfsfm.networks.receptive_field import MeasuredField, Network, effective, measured, theoretical, theoretical_corner

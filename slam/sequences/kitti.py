@@ -37,10 +37,9 @@ from erfsfm.common.readers.kitti_drives import (
     find_odometry_root,
     odometry_camera,
 )
-from erfsfm.common.readers.kitti_sensors import VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP, read_packet
+from erfsfm.common.readers.kitti_sensors import VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP, read_packet, read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
 from erfsfm.common.readers.pinhole import Pinhole
-from erfsfm.common.readers.kitti_sensors import read_velodyne
 from slam.formats.ply import read_ply
 from slam.formats.trajectory import read_trajectory
 from slam.geometry import se3

@@ -17,7 +17,6 @@ import numpy as np
 
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
-from erfsfm.common.readers.kitti_sensors import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles
 from slam.formats.rows import BadRows, in_seconds, number_or_nan
 from slam.frames import Frame, Intrinsics

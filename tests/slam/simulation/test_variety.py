@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from slam.simulation.optics import pixel_rays
+from slam.simulation.sensors import pixel_rays
 
 from slam.geometry import se3
 from slam.simulation.geometry import FLAT, Material, Soup

@@ -74,7 +74,8 @@ def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
         raise ConfigError(f"configuration '{file_or_name}' is a folder, not a YAML file")
     nearest = difflib.get_close_matches(path.stem, known, 1)
     hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
-    names = ", ".join(name for name in sorted(known) if "-" not in name)  # variants of one of these have a dash
+    begun = [name for name in sorted(known) if name.startswith(path.stem)]  # "table1" is the beginning of many
+    names = ", ".join(begun or (name for name in sorted(known) if "-" not in name))  # variants have a dash
     raise ConfigError(f"no configuration file or name '{file_or_name}' (known names: {names or 'none'}){hint}")
 
 

@@ -67,8 +67,16 @@ class _Lines:
         text = f"{self.stage}: {self._done} of {self._total}"
         if done <= 0 or spent_s <= 0 or self._done >= self._total:
             return f"{text} after {spent_s:.0f} s"
-        left_s = round((self._total - self._done) * spent_s / done)
-        return f"{text}, {done / spent_s:.2g} a second, {left_s // 60} min {left_s % 60} s left"
+        return f"{text}, {done / spent_s:.2g} a second, {duration((self._total - self._done) * spent_s / done)} left"
+
+
+def duration(seconds: float) -> str:
+    """As minutes and seconds, from two hours on in hours, from two days on in days."""
+    if seconds >= 2 * 86400:
+        return f"{seconds / 86400:.1f} days"
+    if seconds >= 2 * 3600:
+        return f"{seconds / 3600:.1f} hours"
+    return f"{round(seconds) // 60} min {round(seconds) % 60} s"
 
 
 @contextmanager

@@ -39,21 +39,6 @@ class VisualOdometryConfig(Section):
         description="exponent on the local inlier ratio that weighs corners down on dynamic objects; 0: off",
     )
     min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
-    jitter_rotation_ratio: float = Field(
-        default=0.33, ge=0, description="rotation sigma over the rotation jitter of the camera"
-    )
-    jitter_direction_ratio: float = Field(
-        default=8.5, ge=0, description="sigma of the translation direction over the rotation jitter of the camera"
-    )
-    turn_rotation_ratio: float = Field(
-        default=0.007, ge=0, description="rotation sigma over the rotation angle of the step"
-    )
-    neighbour_rotation_ratio: float = Field(
-        default=0.25, ge=0, description="rotation sigma over the difference to the rotations of neighbouring steps"
-    )
-    neighbour_direction_ratio: float = Field(
-        default=1.0, ge=0, description="sigma of the translation direction over the difference to neighbouring steps"
-    )
 
 
 class RoadConfig(Section):

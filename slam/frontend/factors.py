@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
@@ -29,16 +28,15 @@ from slam.geometry.se3 import FloatArray, compose, rigid
 logger = logging.getLogger(__name__)
 
 
-def make_factors(drive: Drive, scale: Scale, visual_odometry: VisualOdometryConfig) -> list[RelativePose]:
+def make_factors(drive: Drive, scale: Scale) -> list[RelativePose]:
     """All relative poses with their noise, in the unit of the scale.
 
     Args:
         drive: completed.
         scale: of each frame, and the lengths of steps.
-        visual_odometry: noise of image geometry.
     """
     maps = drive.map_poses
-    geometric = _geometric(drive.steps, scale, visual_odometry)
+    geometric = _geometric(drive.steps, scale)
     by_keyframes = scaled_poses(maps.poses, maps, scale)
     steps = network_steps(drive.trusted)
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
@@ -111,9 +109,9 @@ def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
     return factor.source == KEYFRAME_SOURCE, factor.source != NETWORK_SOURCE, factor.from_index
 
 
-def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> list[RelativePose]:
+def _geometric(steps: StepTable, scale: Scale) -> list[RelativePose]:
     """Every step of image geometry: with its own length where that was measured, else by learned depth."""
-    noise = _step_noise(steps, scale, config)
+    noise = _step_noise(steps, scale)
     factors = []
     for ends, motion in steps.motions.items():
         length = scale.lengths.get(ends)
@@ -125,11 +123,11 @@ def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> 
     return factors
 
 
-def _step_noise(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> Mapping[Ends, StepNoise]:
+def _step_noise(steps: StepTable, scale: Scale) -> Mapping[Ends, StepNoise]:
     """Noise of the triangulated steps besides that of the corners, by their order in the drive."""
     motions = steps.triangulated
     place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}
     T_by_place = {n: motions[ends].relative_pose.T_from_to for ends, n in place.items()}
     own = {n: motions[ends].own_noise for ends, n in place.items()}
-    inflated = inflate_step_sigmas(T_by_place, own, config)
+    inflated = inflate_step_sigmas(T_by_place, own)
     return {ends: inflated[n] for ends, n in place.items()}

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.inference import depth_at, limit_torch_threads
+from erfsfm.inference import DepthPosePredictor, depth_at, limit_torch_threads
 from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
 from slam.frames import DepthMap, Frame, Image, Intrinsics, Predictor, SnippetPoses
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers, Undistort
@@ -102,9 +104,30 @@ def open_depth(
     return DepthFolder(config, numbers, intrinsics.width, intrinsics.height, undistort)
 
 
-def make_predictor(
-    networks: Networks, source: DepthSource | None, config: DepthConfig, intrinsics: Intrinsics
-) -> Predictor:
-    """The networks, with depth by ``source`` where there is one."""
+@dataclass(frozen=True)
+class Prediction:
+    """Networks, the source of depth where that is another, and both as the predictor of a run."""
+
+    networks: DepthPosePredictor
+    source: DepthSource | None
+    predictor: Predictor
+
+
+def open_prediction(
+    weights: str | Path,
+    device: str,
+    depth: DepthConfig,
+    intrinsics: Intrinsics,
+    numbers: FrameNumbers | None = None,
+    undistort: Undistort | None = None,
+) -> Prediction:
+    """Networks by the name of shipped weights or a training output folder, with depth as configured.
+
+    Raises:
+        SlamError: as `open_depth`.
+        ErfsfmError: as ``DepthPosePredictor.from_weights``.
+    """
+    source = open_depth(depth, intrinsics, numbers, undistort)
+    networks = DepthPosePredictor.from_weights(weights, device, "onnx")
     own = NetworkPredictor(networks, intrinsics)
-    return own if source is None else SourcedPredictor(own, source, config.align)
+    return Prediction(networks, source, own if source is None else SourcedPredictor(own, source, depth.align))

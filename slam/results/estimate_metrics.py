@@ -41,6 +41,7 @@ from slam.results.metrics import (
     TrackingMetrics,
     Trajectories,
 )
+from slam.runtime.attempt import Failed
 from slam.runtime.run_files import TRAJECTORIES
 from slam.runtime.storage.record import Missing
 from slam.runtime.timing import Stopwatch, peak_rss_mb
@@ -169,7 +170,7 @@ def _scale(result: Estimate) -> ScaleMetrics:
 
 def _graph(result: Estimate) -> GraphMetrics:
     """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
-    if isinstance(result.graph, Missing):
+    if isinstance(result.graph, Failed):
         return GraphMetrics.missing(result.graph.reason)
     nodes, factors = len(result.optimised), result.graph.relative_poses
     if result.reference is None:

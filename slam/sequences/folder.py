@@ -21,7 +21,7 @@ from slam.sequences.recording import RecordedSequence, Source, read_stamps, unif
 
 logger = logging.getLogger(__name__)
 
-TIMES = "times.txt"
+TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 # seconds since 1970 with decimals, milli-, micro- or nanoseconds
 _NAMED_BY_TIME = re.compile(r"(?:\D*[_-])?(\d{10})(?:[._])?(\d{3,9})")
 
@@ -40,7 +40,7 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     stored = ImageFiles(files)
     places = (where, folder, folder.absolute().parent)
     camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
-    stamps = _stamps((where / TIMES, folder / TIMES), files, camera.fps)
+    stamps = _stamps([place / name for place in (where, folder) for name in TIMES], files, camera.fps)
     name = recording_name(folder)
     return RecordedSequence(
         name=name,
@@ -51,7 +51,7 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     )
 
 
-def _stamps(places: tuple[Path, ...], files: NumberedFiles, fps: float) -> FloatArray:
+def _stamps(places: list[Path], files: NumberedFiles, fps: float) -> FloatArray:
     """By a file, by names that are times since 1970, or at the rate of the camera."""
     path = next((path for path in places if path.exists()), None)
     if path is not None:

@@ -17,7 +17,7 @@ from slam.runtime.errors import SequenceError
 
 logger = logging.getLogger(__name__)
 
-_MAX_GAP_S = 0.1
+_REACH_S, _BRIDGED = (0.1, 0.3), 1.5  # bounds, and in periods of the poses
 _FARTHEST = 1e12
 _LENGTH_TOLERANCE = 0.1  # of quaternions, which are written with few digits
 _ROTATION_TOLERANCE = 0.01  # 7-Scenes writes seven digits, ScanNet six
@@ -48,25 +48,29 @@ def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
 
 
 def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path) -> FloatArray:
-    """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``.
+    """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from poses ``(M, 4, 4)`` at increasing stamps ``(M,)``.
 
-    NaN, with a warning, where the nearest known pose is more than 0.1 s away.
+    The motion goes on at both ends. NaN, with a warning, where the nearest known pose is more than 0.1 s away; of poses
+    as rare as images a missing one is bridged, up to 0.3 s.
 
-    Raises:
-        SequenceError: the stamps of the poses, which were read from ``path``, do not increase.
+    Args:
+        T_any_camera: what is known, from ``path``.
+        known: its stamps in seconds.
+        stamps: those of the images.
+        path: for the warning.
     """
     T_near = np.full((len(stamps), 4, 4), np.nan)
-    if len(known) < 2:
-        describe_unknown(T_near, path)
-        return T_near
-    if not (np.diff(known) > 0).all():
-        raise SequenceError(
-            f"{path} row {int(np.argmin(np.diff(known) > 0)) + 2}: stamps must increase; correct the row"
-        )
-    before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
-    gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
-    T_near = se3.interpolate(T_any_camera, known, stamps)
-    T_near[gap > _MAX_GAP_S] = np.nan
+    if len(known) > 1:
+        reach_s = float(np.clip(_BRIDGED * np.median(np.diff(known)), *_REACH_S))
+        first, last = np.searchsorted(known, (known[0] + reach_s, known[-1] - reach_s), side="right") - (0, 1)
+        first, last = min(first, len(known) - 1), max(last, 0)
+        before = T_any_camera[0] @ se3.invert(T_any_camera[first]) @ T_any_camera[0]
+        after = T_any_camera[-1] @ se3.invert(T_any_camera[last]) @ T_any_camera[-1]
+        reached = np.r_[2 * known[0] - known[first], known, 2 * known[-1] - known[last]]
+        T_near = se3.interpolate(np.concatenate([before[None], T_any_camera, after[None]]), reached, stamps)
+        place = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
+        gap = np.minimum(np.abs(stamps - known[place]), np.abs(known[place + 1] - stamps))
+        T_near[gap > reach_s] = np.nan
     describe_unknown(T_near, path)
     return T_near
 

@@ -7,6 +7,7 @@ Every kind of data set is opened by a function that returns a ``RecordedSequence
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from collections.abc import Sequence as Items
 from dataclasses import InitVar, dataclass, field
@@ -19,7 +20,7 @@ from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.common.readers.scan import read_velodyne
-from slam.formats.rows import BadRows, number_or_nan
+from slam.formats.rows import BadRows, in_seconds, number_or_nan
 from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, sequence_errors
@@ -233,17 +234,20 @@ def fallback_stamps(path: Path, frames: int) -> FloatArray:
 
 
 def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
-    """A file with one time in seconds a row, checked by `require_stamps`.
+    """A file with one time in seconds a row, perhaps after a number or a name, checked by `require_stamps`.
 
     Raises:
         SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
     """
     try:
-        words = [line.strip() for line in read_text(path).splitlines() if line.strip()]
+        lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
-    stamps = np.array([number_or_nan(word) for word in words])
-    return require_stamps(stamps, path, files)
+    rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line.strip())] for line in lines]
+    rows = rows[1:] if rows and np.isnan(rows[0]).all() else rows  # a header
+    first, second = (np.array([row[k] if k < len(row) else np.nan for row in rows]) for k in (0, 1))
+    is_numbered = np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()  # NaN is a name
+    return require_stamps(second if is_numbered else first, path, files)
 
 
 def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> FloatArray:
@@ -276,17 +280,14 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
 
 def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     bad, rows = BadRows(path, SequenceError), np.arange(1, len(stamps) + 1)
-    good = np.isfinite(stamps)
-    (known,) = bad.without(good, "not a time in seconds", rows)
-    good[good] = bad.in_order(stamps[good], "stamps", known)
-    bad.say(int(good.sum()) if good.sum() > 1 else 0, "times in seconds that increase, one a row")
-    if len(bad):
-        known, times = rows[good], stamps[good]
-        period = float(np.median(np.diff(times) / np.diff(known)))
-        reach = np.array([-len(rows), len(rows)])  # at both ends the rate goes on
-        times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
-        stamps = np.interp(rows, np.r_[known[0] + reach[0], known, known[-1] + reach[1]], times)
-    return stamps
+    rows, times = bad.without(np.isfinite(stamps), "not a time in seconds", rows, stamps)
+    order = bad.in_order(times, "stamps", rows)
+    bad.say(len(order) if len(order) > 1 else 0, "times in seconds that increase, one a row")
+    rows, times = np.sort(rows[order]), times[order]
+    period = float(np.median(np.diff(times) / np.diff(rows)))
+    reach = np.array([-len(stamps), len(stamps)])  # at both ends the rate goes on
+    times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
+    return np.interp(np.arange(1, len(stamps) + 1), np.r_[rows[0] + reach[0], rows, rows[-1] + reach[1]], times)
 
 
 def scans_in(folder: Path, files: NumberedFiles) -> dict[int, ScanReader]:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from slam.formats.trajectory import read_trajectory
+from slam.formats.trajectory import other_unit, read_trajectory
 from slam.runtime.errors import SequenceError
-from slam.sequences.poses import describe_unknown, known_poses, poses_near
+from slam.sequences.poses import known_poses, poses_near
 from slam.sequences.recording import RecordedSequence
 
 
@@ -29,18 +27,20 @@ def take_truth(recording: object, path: Path) -> None:
     if truth.timed:
         T_any_camera = poses_near(truth.T_world_camera, truth.stamps, recording.stamps, path)
     elif truth.numbered or truth.frame_count == frames:
-        T_any_camera = np.full((frames, 4, 4), np.nan)
         of_frame = (numbers >= 0) & (numbers < frames)
-        T_any_camera[numbers[of_frame]] = truth.T_world_camera[of_frame]
-        describe_unknown(T_any_camera, path)
+        known = recording.stamps[numbers[of_frame]]
+        T_any_camera = poses_near(truth.T_world_camera[of_frame], known, recording.stamps, path)
     else:
         raise SequenceError(
             f"--truth {path} has {truth.frame_count} rows and the recording {frames} frames: give each frame a row, "
             "or rows with stamps (TUM)"
         )
-    if not known_poses(T_any_camera).any():
+    cure = other_unit(truth.stamps, recording.stamps) if truth.timed else None
+    if cure or not known_poses(T_any_camera).any():
         its, ours = (f"{numbers[0]:.3f} to {numbers[-1]:.3f}" for numbers in (truth.stamps, recording.stamps))
-        raise SequenceError(f"--truth {path} covers {its} and the recording {ours}: bring both to the same clock")
+        raise SequenceError(
+            f"--truth {path} covers {its} and the recording {ours}: {cure or 'bring both to the same clock'}"
+        )
     recording.take_truth(T_any_camera)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import by_table
-from slam.formats.rows import BadRows, number_or_nan
+from slam.formats.rows import BadRows, in_seconds, number_or_nan
 from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -84,15 +84,14 @@ def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
     bad = BadRows(path, SequenceError)
     rows = []
     for line, text in enumerate(_text(path).splitlines(), start=1):
-        words = text.split()
+        words = text.replace(",", " ").split()
         if not words or words[0].startswith("#"):
             continue
-        if len(words) == 2 and math.isfinite(number_or_nan(words[0])):
-            rows.append((line, float(words[0]), path.parent / words[1]))
+        stamp = number_or_nan(in_seconds(words[0]))
+        if len(words) == 2 and math.isfinite(stamp):
+            rows.append((line, stamp, path.parent / words[1]))
         else:
             bad.add(line, f"{text!r} is not 'stamp file'")
-    if path.name == _DEPTH_INDEX:
-        rows.sort(key=lambda row: row[1])  # it is looked up by time alone
     return bad.ordered(rows, "rows of 'stamp file'")
 
 

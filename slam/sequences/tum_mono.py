@@ -10,8 +10,7 @@ import numpy as np
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import has_images, list_images
-from erfsfm.common.readers.numbering import NumberedFiles, by_name
-from slam.formats.rows import number_or_nan
+from erfsfm.common.readers.numbering import by_name
 from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -19,7 +18,7 @@ from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near
-from slam.sequences.recording import RecordedSequence, Source, require_stamps
+from slam.sequences.recording import RecordedSequence, Source, read_stamps
 
 _CAMERA, _TIMES, _TRUTH = "camera.txt", "times.txt", "groundtruthSync.txt"
 _LENS = "FOV"
@@ -38,7 +37,7 @@ def open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
         raise SequenceError(f"no images in {folder / 'images'}: unpack images.zip there")
     files = by_name(list_images(folder / "images"))
     stored = ImageFiles(files)
-    stamps = _stamps(folder / _TIMES, files)
+    stamps = read_stamps(folder / _TIMES, files)
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     camera = own_camera(partial(_camera, folder / _CAMERA, fps), asked, stored, folder)
     return RecordedSequence(
@@ -65,16 +64,6 @@ def _camera(path: Path, fps: float) -> CameraFile:
     keys = {"fx": fx * width, "fy": fy * height, "cx": cx * width - 0.5, "cy": cy * height - 0.5}
     lens = {"model": "fov", "distortion": [angle]} if angle else {}
     return camera_of({"width": width, "height": height, "fps": fps, **keys, **lens}, str(path))
-
-
-def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
-    """Rows of number, seconds and perhaps exposure."""
-    try:
-        rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise SequenceError(f"{path} needs rows of number, seconds and exposure: {error}") from error
-    stamps = np.array([number_or_nan(row[1]) if len(row) > 1 else np.nan for row in rows])
-    return require_stamps(stamps, path, files)
 
 
 def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:

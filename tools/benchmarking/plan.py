@@ -45,9 +45,6 @@ QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 WHOLE = (Configuration("no map", (*QUIET, "mapping.enabled=false")),)
 EVERYTHING = Configuration("everything on", QUIET)
-_NO_JITTER = ("visual_odometry.jitter_rotation_ratio=0", "visual_odometry.jitter_direction_ratio=0")
-_NO_TURNS = ("visual_odometry.turn_rotation_ratio=0",)
-_NO_NEIGHBOURS = ("visual_odometry.neighbour_rotation_ratio=0", "visual_odometry.neighbour_direction_ratio=0")
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("visual_odometry.enabled=false",),
     "no predicted flow": ("visual_odometry.predicted_flow=false",),
@@ -59,10 +56,6 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
     "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
     "no short strip of road": ("road.near_heights=1e-3",),
-    "no sigma by jitter": _NO_JITTER,
-    "no sigma by turns": _NO_TURNS,
-    "no sigma by neighbouring steps": _NO_NEIGHBOURS,
-    "no inflation of step sigmas": (*_NO_JITTER, *_NO_TURNS, *_NO_NEIGHBOURS),
     "no gap interpolation": ("gaps.enabled=false",),
     "no loops": ("loops.enabled=false",),
     "no consistency among loops": ("loops.min_support=0",),

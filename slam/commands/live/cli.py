@@ -22,8 +22,7 @@ def live(request: LiveRequest) -> None:
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.messages import write_line
-    from slam.commands.live.run import run_live
+    from slam.commands.live.run import run_live, write_line
 
     command = shlex.join(["erfsfm-slam", *sys.argv[1:]])
     folder = run_live(replace(request, command=command), partial(write_line, sys.stdout))

@@ -25,6 +25,7 @@ from slam.sequences.camera_file import explicit_camera, mount_beside
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import poses_near
 from slam.sequences.recording import (
     RecordedSequence,
     Source,
@@ -101,12 +102,10 @@ def _true_poses(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_c
             f"the poses to match, or remove the file to run without a reference"
         )
     rows, skipped = assigned
-    T_world_cam0 = np.full((found.frame_count, 4, 4), np.nan)
-    T_world_cam0[found.frame_numbers] = found.T_world_camera
-    T_world_camera = T_world_cam0[skipped:] @ se3.invert(T_camera_cam0)
-    if len(rows) < len(files):
-        T_world_camera = se3.interpolate(T_world_camera, stamps[rows], stamps)
-    return T_world_camera
+    places = found.frame_numbers - skipped
+    of_images = places >= 0
+    T_any_camera = found.T_world_camera[of_images] @ se3.invert(T_camera_cam0)
+    return poses_near(T_any_camera, stamps[rows[places[of_images]]], stamps, path)
 
 
 def _T_camera_lidar(calibration: CalibrationFile, T_camera_cam0: FloatArray) -> FloatArray | None:

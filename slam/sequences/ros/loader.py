@@ -39,7 +39,7 @@ from slam.sequences.ros.messages import (
     shows_pictures,
     values_of,
 )
-from slam.sequences.ros.transforms import StaticTransforms, moving_frames, transform_of
+from slam.sequences.ros.transforms import MOVING_TOPIC, StaticTransforms, moving_frames, transform_of
 
 logger = logging.getLogger(__name__)
 
@@ -49,8 +49,8 @@ _POSES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
-_FIX = "sensor_msgs/msg/NavSatFix"
-_TRUTH = re.compile(r"ground_?truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack", re.IGNORECASE)
+_POSITIONS = ("sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped")
+_TRUTH = re.compile(r"truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack|qualisys|natnet", re.IGNORECASE)
 _CACHED_FRAMES = 32
 _MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
@@ -224,23 +224,27 @@ def _home(topic: str) -> str:
 
 def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps from a topic or frame that is named as truth, NaN where unknown."""
-    topics = bag.topics(*_POSES)
-    for topic in filter(_TRUTH.search, topics):
-        body = getattr(bag.first(topic), "child_frame_id", None)
+    unused = dict.fromkeys(bag.topics(*_POSITIONS), "has positions without rotations")
+    for topic in bag.topics(*_POSES):
+        first = bag.first(topic)
+        body = getattr(first, "child_frame_id", None)
         T_body_camera = np.eye(4) if body is None else mounted.between(body, camera)
-        if T_body_camera is None:
-            logger.warning("%s is not used: no static transform from its %r to the camera's %r", topic, body, camera)
-            continue
-        if body is None:
-            logger.warning("%s does not say whose poses it has: they are taken for the camera's", topic)
-        known, T_any_body = _poses(StampedMessages(bag, topic))
-        return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
+        if not any(map(_TRUTH.search, (topic, first.header.frame_id, body or ""))):
+            unused[topic] = "is not named as truth"
+        elif T_body_camera is None:
+            unused[topic] = f"has no static transform from its {body!r} to the camera's {camera!r}"
+        else:
+            if body is None:
+                logger.warning("%s does not say whose poses it has: they are taken for the camera's", topic)
+            known, T_any_body = _poses(StampedMessages(bag, topic))
+            return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
     for (parent, body), (known, T_any_body) in moving_frames(bag).items():
         T_body_camera = mounted.between(body, camera)
-        if T_body_camera is not None and _TRUTH.search(parent):
+        if T_body_camera is not None and any(map(_TRUTH.search, (parent, body))):
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
-    for topic in (*topics, *bag.topics(_FIX)):
-        logger.warning("%s (%s) is not used: its name does not say that it is the truth", topic, bag.types[topic])
+        unused[f"{parent} to {body} in {MOVING_TOPIC}"] = "is not named as truth, or not joined to the camera"
+    for topic, reason in unused.items():
+        logger.warning("%s %s: it is not used; a TUM file of true poses is taken by --truth", topic, reason)
     return None
 
 
@@ -293,7 +297,7 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
             raise SequenceError(f"bag {path} has no topic with images of a camera: it holds {held}")
         return {topic: _opener(path, topic, len(topics) > 1, asked) for topic in topics}
     found = {}
-    for file in sorted(path.glob("*.bag")) if path.is_dir() else ():
+    for file in sorted(filter(is_bag, path.iterdir())) if path.is_dir() else ():
         topics = camera_topics(file)
         for topic in topics:
             found[f"{file.stem}{topic}" if len(topics) > 1 else file.stem] = _opener(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from erfsfm.common import command_line, errors
+from erfsfm.common import command_line
 from erfsfm.common.errors import DataError
 
 Outcome = Callable[..., tuple[int, str]]
@@ -73,17 +73,3 @@ def raising(error: Exception) -> Callable[[object], object]:
 def test_every_error_is_one_line(outcome: Outcome, error: Exception, line: str) -> None:
     code, err = outcome(raising(error))
     assert code == 1 and err.startswith(line) and len(err.splitlines()) == 1
-
-
-def test_an_unexpected_error_is_shown_where_that_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["program"])
-    monkeypatch.setenv(errors.SHOW_TRACEBACK, "1")
-    with pytest.raises(ZeroDivisionError):
-        command_line.run(lambda args, prog_name: raising(ZeroDivisionError())(args), "program", logging.WARNING)
-
-
-def test_an_error_of_a_data_loaders_process_is_its_last_line() -> None:
-    text = "Caught DataError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n  File x\n"
-    assert str(DataError(f"{text}erfsfm.common.errors.DataError: image a.png is empty: copy it again\n")) == (
-        "image a.png is empty: copy it again"
-    )

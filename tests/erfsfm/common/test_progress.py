@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from erfsfm.common.progress import progress_bar, progress_lines
+from erfsfm.common.progress import duration, progress_bar, progress_lines
 
 
 def lines_of(steps: list[tuple[str, int, int]], pause_s: float) -> list[str]:
@@ -27,6 +27,11 @@ def test_lines_say_what_is_done_how_fast_and_the_time_left() -> None:
     assert lines[0].startswith("frames: 1 of 100 after ")
     assert any(re.fullmatch(r"frames: 2 of 100, [\d.e+-]+ a second, \d min \d+ s left", line) for line in lines)
     assert lines[-1].startswith("loops: 0 of 1 after "), "said while one item takes long"
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(68, "1 min 8 s"), (9000, "2.5 hours"), (420_000, "4.9 days")])
+def test_long_times_are_said_in_hours_and_days(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
 
 
 def test_short_work_is_quiet_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from slam.config.sections import KeyframesConfig, load_config
 from slam.loops.descriptors import FeatureExtractor
 from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.submap import Fusion
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.run import SlamPipeline
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

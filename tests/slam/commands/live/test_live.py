@@ -24,10 +24,9 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live.reader import Reader
+from slam.commands.live.reader import Reader, StreamedSequence, calibration_of
 from slam.commands.live.request import LiveRequest
 from slam.commands.live.run import run_live
-from slam.commands.live.sequence import StreamedSequence, calibration_of
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
 from slam.runtime.errors import RunError, SequenceError, SlamError

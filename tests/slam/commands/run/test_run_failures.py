@@ -21,7 +21,7 @@ from slam import run_slam
 from slam.commands.cli import main
 from slam.formats.ply import read_ply
 from slam.formats.trajectory import read_trajectory
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 
@@ -182,10 +182,10 @@ def test_a_stage_that_fails_costs_its_results(
         raise KeyError(0)
 
     place = {
-        "loops": "slam.pipeline.batch.close_loops",
+        "loops": "slam.pipeline.run.close_loops",
         "graph": "slam.graph.pose_graph.PoseGraph.optimise",
-        "map": "slam.pipeline.batch.SlamPipeline.fuse",
-        "report": "slam.commands.run.job.write_report",
+        "map": "slam.pipeline.run.SlamPipeline.fuse",
+        "report": "slam.commands.run.recorder.write_report",
     }
     monkeypatch.setattr(place[stage], failing)
     words = ["--dataset", quick["dataset"], "--weights", quick["weights"], "--frames", "0:8"]
@@ -235,7 +235,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from slam import run_slam
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.run import SlamPipeline
 
 def kill(*_):
     os.kill(os.getpid(), signal.SIGKILL)

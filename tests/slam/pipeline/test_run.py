@@ -25,12 +25,11 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.pipeline import batch
-from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
+from slam.pipeline.run import Recorder, SlamPipeline
 from slam.prediction.assembly import NetworkPredictor
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.record import Missing
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
@@ -136,18 +135,22 @@ def test_an_error_in_loops_or_graph_costs_these(stage: str, monkeypatch: pytest.
     def failing(*_: object) -> None:
         raise KeyError(7)
 
+    class Keeping(Recorder):
+        def trajectory(self, name: str, trajectory: Trajectory) -> None:
+            kept.append((name, len(trajectory)))
+
     drive, kept = LevelRoad(turning(30)), []
     assert drive.reference is not None
     pipeline = SlamPipeline(drive, OraclePredictor(drive.reference, road), load_config(None, NO_IMAGES))
-    monkeypatch.setattr(batch, stage, failing)
-    result = pipeline.estimate(keep=lambda name, trajectory: kept.append((name, len(trajectory))))
+    monkeypatch.setattr(f"slam.pipeline.run.{stage}", failing)
+    result = pipeline.run(Keeping())
     assert kept == [("reference", 30), ("network", 30), ("odometry", 30)]
     assert result.loops.not_sought is not None and "KeyError: 7 (test_batch.py:" in result.loops.not_sought
-    assert isinstance(result.graph, Missing) == (stage == "PoseGraph")
+    assert isinstance(result.graph, Failed) == (stage == "PoseGraph")
     assert ate(result.optimised, result.reference) < 1e-3
     monkeypatch.setenv(SHOW_TRACEBACK, "1")
     with pytest.raises(KeyError):
-        pipeline.estimate()
+        pipeline.run()
 
 
 def test_scale_drift_is_corrected_by_the_ground_plane() -> None:

@@ -11,7 +11,7 @@ from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
-from slam.pipeline.keyframe_depth import KeyframeDepths
+from slam.pipeline.fusion import KeyframeDepths
 from slam.runtime.storage.spill import SpillFile
 
 CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)

@@ -10,7 +10,9 @@ import typer
 
 from erfsfm.cli_options import Device, Fidelity, Json, UnusedSeed, Weights, print_rows
 
-evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of trained networks.")
+evaluate_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Depth and pose errors of trained networks."
+)
 
 
 @evaluate_app.command("depth")

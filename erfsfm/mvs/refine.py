@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.projection import Projection, halved
-from erfsfm.mvs.semi_global import Costs, smoothed
-from erfsfm.mvs.sweep import is_inside, lowest, sweep, warped
+from erfsfm.mvs.sweep import Costs, is_inside, lowest, smoothed, sweep, warped
 
 STEPS = 2
 WINDOW_PX = 5

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from erfsfm.common.errors import COUNTED, OneLineError, explained, shows_traceback
+from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
 from slam.frontend.drive import Drive, Keyframe
@@ -28,9 +28,8 @@ from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking, height_of
 from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
-from slam.runtime.memory import return_freed_memory
 from slam.runtime.storage.spill import SpillFile
-from slam.runtime.timing import Stopwatch
+from slam.runtime.timing import Stopwatch, return_freed_memory
 
 logger = logging.getLogger(__name__)
 
@@ -117,8 +116,8 @@ class Observer:
         self._keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
         )
-        self._road = RoadHomography(config.road, intrinsics)
-        self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
+        self._road = RoadHomography(intrinsics)
+        self._plane = GroundPlaneFitter(intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
         self._snippet_frames: tuple[Frame, ...] = ()
         self._recent: tuple[FrameInWork, ...] = ()
@@ -387,7 +386,7 @@ class Observer:
         if is_se3(snippet.T_source_target):
             self.drive.snippets.append(snippet)
         else:
-            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE, extra=COUNTED)
+            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE)
 
     def _keep_rotation(self, rotation: Any) -> None:
         if rotation is not None:

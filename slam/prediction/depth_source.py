@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.errors import COUNTED
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
 from slam.runtime.errors import SlamError
 
@@ -69,7 +68,7 @@ class SourcedPredictor:
         """Z-depth ``(H, W)`` at the image's size, NaN where unknown."""
         depth, unit = self._aligned(frame)
         if np.isnan(unit):
-            logger.warning("frame %d has no known depth in %s", frame.index, self._source.name, extra=COUNTED)
+            logger.warning("frame %d has no known depth in %s", frame.index, self._source.name)
         return depth
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:

@@ -11,23 +11,20 @@ import re
 from collections.abc import Callable
 from collections.abc import Sequence as Items
 from dataclasses import InitVar, dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.kitti_sensors import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles
-from erfsfm.common.readers.scan import read_velodyne
 from slam.formats.rows import BadRows, in_seconds, number_or_nan
 from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
-from slam.runtime.errors import SequenceError, sequence_errors
-from slam.sequences.camera_file import DEFAULT_FPS
-from slam.sequences.depth_maps import DepthMaps
+from slam.runtime.errors import SequenceError, SlamError, sequence_errors
 from slam.sequences.gps import FASTEST_M_S
-from slam.sequences.images import ImageFiles, ImageSource, too_long
+from slam.sequences.images import DepthMaps, ImageFiles, ImageSource, too_long
 from slam.sequences.poses import known_poses, rebased
 from slam.sequences.undistortion import calibrated
 
@@ -185,6 +182,37 @@ class RecordedSequence:
         return labels(self.sources, len(self))
 
 
+@dataclass
+class GrowingSequence:
+    """A sequence that grows by a frame at a time; its images are not kept."""
+
+    intrinsics: Intrinsics
+    camera_height_m: float | None
+    stamps: FloatArray = field(default_factory=lambda: np.zeros(0))
+    name: str = "live"
+    reference: FloatArray | None = None
+    T_camera_lidar: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def frame(self, index: int) -> Frame:
+        """Always ``SlamError``: images are not kept."""
+        raise SlamError(f"frame {index} of a live drive is not kept")
+
+    def has_scan(self, index: int) -> bool:
+        """False: there are no scans."""
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        """Always ``SlamError``: there are no scans."""
+        raise SlamError(f"frame {index} of a live drive has no scan")
+
+    def provenance(self) -> tuple[str, ...]:
+        """Unknown."""
+        return ()
+
+
 def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
     """Refuse stamps that cannot be seconds, such as nanoseconds, and warn of unlikely ones and of long pauses."""
     if len(stamps) < 2:
@@ -227,12 +255,6 @@ def uniform_stamps(frames: int, fps: float) -> FloatArray:
     return np.arange(frames, dtype=np.float64) / fps
 
 
-def fallback_stamps(path: Path, frames: int) -> FloatArray:
-    """Uniform stamps in place of a missing file of stamps, with a warning."""
-    logger.warning("no %s: %g frames a second are assumed", path, DEFAULT_FPS)
-    return uniform_stamps(frames, DEFAULT_FPS)
-
-
 def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
     """A file with one time in seconds a row, perhaps after a number or a name, checked by `require_stamps`.
 
@@ -244,7 +266,8 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
     rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line.strip())] for line in lines]
-    rows = rows[1:] if rows and np.isnan(rows[0]).all() else rows  # a header
+    has_header = files.rows_of(len(rows)) is None and files.rows_of(len(rows) - 1) is not None
+    rows = rows[has_header:]
     first, second = (np.array([row[k] if k < len(row) else np.nan for row in rows]) for k in (0, 1))
     is_numbered = np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()  # NaN is a name
     return require_stamps(second if is_numbered else first, path, files)
@@ -288,12 +311,6 @@ def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     reach = np.array([-len(stamps), len(stamps)])  # at both ends the rate goes on
     times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
     return np.interp(np.arange(1, len(stamps) + 1), np.r_[rows[0] + reach[0], rows, rows[-1] + reach[1]], times)
-
-
-def scans_in(folder: Path, files: NumberedFiles) -> dict[int, ScanReader]:
-    """The LiDAR scans of a folder of KITTI by frame, by the numbers of the images."""
-    paths = (path for path in folder.glob("*.bin") if path.stem.isdecimal())
-    return {int(path.stem) - files.first: partial(read_velodyne, path) for path in paths}
 
 
 def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:

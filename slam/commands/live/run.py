@@ -7,16 +7,16 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import Any, TextIO
+from typing import Any, Literal, TextIO
 
 import numpy as np
 
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import raising_on_termination
 from slam.commands.live.reader import EXPECTED, StreamedSequence, calibration_of
-from slam.commands.live.request import LiveRequest
 from slam.commands.live.source import open_source
 from slam.commands.live.view import Viewer
 from slam.commands.run.recorder import FolderRecorder
@@ -36,13 +36,31 @@ from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
 from slam.sequences.camera_file import as_known
-from slam.sequences.growing import GrowingSequence
+from slam.sequences.recording import GrowingSequence
 from slam.sequences.undistortion import intrinsics_of
 
 logger = logging.getLogger(__name__)
 
 Emit = Callable[[dict[str, Any]], None]
 _DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """All inputs of a live run, as ``erfsfm-slam live --help`` says; ``command`` is recorded in the metrics."""
+
+    dataset: str
+    camera: Path | None = None
+    every_frame: bool = False
+    output: Path | None = None
+    view: bool = False
+    wait: float = 10.0
+    weights: str = "default"
+    config: str | None = None
+    overrides: list[str] | None = None
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    command: str = "slam.commands.live.run.run_live"
 
 
 def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
@@ -63,9 +81,9 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         if request.view:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
-        source = open_source(request.source, request.wait)
-        camera = calibration_of(request.source, request.camera_file, source)
-        source.fps, intrinsics, name = camera.fps, intrinsics_of(camera), Path(request.source).stem or "live"
+        source = open_source(request.dataset, request.wait)
+        camera = calibration_of(request.dataset, request.camera, source)
+        source.fps, intrinsics, name = camera.fps, intrinsics_of(camera), Path(request.dataset).stem or "live"
         prediction = open_prediction(request.weights, request.device, settings.depth, intrinsics)
         networks = prediction.networks
         growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
@@ -75,14 +93,14 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         networks.poses([blank] * (networks.sources + 1))
         viewer = Viewer(intrinsics) if request.view else None
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
-        sequence.intrinsics = as_known(sequence.intrinsics, request.camera_file)
+        sequence.intrinsics = as_known(sequence.intrinsics, request.camera)
         reader = sequence.reader
         try:
             pipeline = SlamPipeline(sequence, prediction.predictor, settings, seed=request.seed)
             folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
             recorded = RunRequest(
-                Path(request.source),
-                camera=request.camera_file,
+                Path(request.dataset),
+                camera=request.camera,
                 weights=request.weights,
                 seed=request.seed,
                 command=request.command,

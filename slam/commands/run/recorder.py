@@ -10,7 +10,7 @@ from dataclasses import asdict
 from erfsfm.common.errors import explained
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import SlamConfig, dump_yaml
-from slam.evaluation.double_walls import double_wall_share
+from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image
@@ -22,16 +22,14 @@ from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors
-from slam.results.metrics import MapMetrics, Metrics, Provenance
+from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
-from slam.results.report.page import write_report
+from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
-from slam.results.report.rendering import Picture
 from slam.runtime.attempt import Failed, attempt
 from slam.runtime.errors import EmptyMapError, SlamError
 from slam.runtime.run_files import CONFIG, GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
 from slam.runtime.storage.files import from_anywhere
-from slam.runtime.storage.record import Missing
 
 logger = logging.getLogger(__name__)
 
@@ -111,16 +109,17 @@ class FolderRecorder(Recorder):
             surface.write_cloud(self.folder.path / MAP_CLOUD)
         with self._stopwatch.stage("evaluation"):
             metric = estimate.scale.is_metric
-            share = double_wall_share(surface.meshes()) if metric else Missing("lengths are not in metres")
+            share = double_wall_share(surface.meshes()) if metric else Failed("lengths are not in metres")
             pieces = lambda: (Ply(piece).points for piece in surface.cloud_pieces())  # noqa: E731
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
         sizes = asdict(estimate.map.statistics())
-        self._metrics = self._metrics.changed(map=MapMetrics(**sizes, double_wall_share=share, **dict(errors)))
+        found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
+        self._metrics = self._metrics.changed(map=found)
 
     def no_map(self, reason: str) -> None:
         """The reason is its metric."""
-        self._metrics = self._metrics.changed(map=MapMetrics.missing(reason))
+        self._metrics = self._metrics.changed(map=MapMetrics.unknown(reason, *SIZES, *MAP_ERRORS))
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""
@@ -140,7 +139,7 @@ class FolderRecorder(Recorder):
         self._progress("report", 1, 1)
 
     def fail(self, error: BaseException) -> str:
-        """Write the reason of a failure and return it; an error of writing it is ignored, for the first is raised."""
+        """Write the reason of a failure, which is returned; errors of writing are ignored, for the first is raised."""
         reason = explained(error) if isinstance(error, Exception) else str(error) or type(error).__name__
         with suppress(SlamError, OSError):
             self.folder.write_metrics(self._metrics.changed(status="failed", reason=reason))

@@ -18,12 +18,10 @@ import slam.results.estimate_metrics
 from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.commands.run import recorder
-from slam.config.sections import PoseGraphConfig
 from slam.graph.pose_graph import PoseGraph
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.storage.record import Missing
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -233,9 +231,9 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
     class Result:
         optimised = run.trajectory("network")
         reference = run.trajectory("reference")
-        graph = PoseGraph(PoseGraphConfig())
+        graph = PoseGraph()
 
     assert Result.optimised is not None
     Result.optimised.T_world_camera[:] = np.eye(4)
     graph = slam.results.estimate_metrics._graph(Result)  # type: ignore[arg-type]
-    assert isinstance(graph.coverage, Missing) and "does not move" in graph.coverage.reason
+    assert "does not move" in graph.coverage.absent

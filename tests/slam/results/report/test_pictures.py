@@ -14,8 +14,8 @@ from slam.geometry.se3 import from_rotation_vector, invert
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop
 from slam.mapping.filters import KeyframeDepth
+from slam.results.report.page import Picture
 from slam.results.report.pictures import DepthPictures, loop_pictures
-from slam.results.report.rendering import Picture
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

@@ -15,7 +15,7 @@ from erfsfm.common.errors import CheckpointError
 from erfsfm.common.files import read_bytes
 from erfsfm.common.onnx_session import open_session
 from erfsfm.mvs.appearance import Array
-from erfsfm.mvs.refine import SIGMA_FLOOR, Measurement, RefinedDepth, Road
+from erfsfm.mvs.refine import SIGMA_FLOOR, Measurement, RefinedDepth
 from erfsfm.mvs.sweep import CHANGES, UNIT, Costs, lowest
 
 FILE = "fusion.onnx"
@@ -58,8 +58,8 @@ class DepthFusion:
                 f"{path} is not a network of erfsfm train-fusion, or of another version: train it again"
             )
 
-    def decide(self, measurement: Measurement, road: Road | None = None) -> RefinedDepth:
-        """As `erfsfm.mvs.refine.by_rules`; the network finds by itself what moves, and needs no road."""
+    def decide(self, measurement: Measurement) -> RefinedDepth:
+        """Between learned and measured depth at each pixel; the network finds by itself what moves."""
         depth, channels = measurement.depth, evidence(measurement)
         h, w = channels.shape[1:]
         padded = np.pad(channels, ((0, 0), (0, -h % STEP), (0, -w % STEP)), mode="edge")

@@ -15,37 +15,12 @@ IntArray = NDArray[np.int64]
 PARAMETERS = 6
 
 
-class Material(IntEnum):
-    """Material of a surface; selects its texture."""
-
-    ASPHALT = 0
-    JUNCTION = 1
-    PAVEMENT = 2
-    KERB = 3
-    GRASS = 4
-    GRAVEL = 5
-    WALL = 6
-    ROOF = 7
-    BARK = 8
-    LEAVES = 9
-    METAL = 10
-    SIGN = 11
-    PAINT = 12
-    GLASS = 13
-    TYRE = 14
-    FENCE = 15
-    PLASTER = 16
-    TILES = 17
-    BOARDS = 18
-    CARPET = 19
-    WOOD = 20
-    FABRIC = 21
-    BOOKS = 22
-    PICTURE = 23
-    SCREEN = 24
-    PANE = 25
-    CARTON = 26
-    LAMP = 27
+Material = IntEnum(  # of a surface; selects its texture
+    "Material",
+    "ASPHALT JUNCTION PAVEMENT KERB GRASS GRAVEL WALL ROOF BARK LEAVES METAL SIGN PAINT GLASS TYRE FENCE "
+    "PLASTER TILES BOARDS CARPET WOOD FABRIC BOOKS PICTURE SCREEN PANE CARTON LAMP",
+    start=0,
+)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -80,18 +80,10 @@ def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Arra
     for k, (wave_u, wave_v, amplitude) in enumerate(octaves):
         pixels = np.minimum(wave_u / texels.u_size, wave_v / texels.v_size)
         weight = np.clip((pixels - 1.2) / 1.8, 0.0, 1.0)
-        visible = weight > 0.0
-        if not visible.all():
-            chosen = np.flatnonzero(visible)
-            if not len(chosen):
-                continue
-            u = (texels.u[chosen] + texels.shift[chosen]) / wave_u + 17.3 * k
-            v = (texels.v[chosen] + texels.shift_v[chosen]) / wave_v + 5.7 * k
-            total[chosen] += amplitude * weight[chosen] * value_noise(u, v)
-            continue
-        u = (texels.u + texels.shift) / wave_u + 17.3 * k
-        v = (texels.v + texels.shift_v) / wave_v + 5.7 * k
-        total += amplitude * weight * value_noise(u, v)
+        seen = np.flatnonzero(weight > 0.0)
+        u = (texels.u[seen] + texels.shift[seen]) / wave_u + 17.3 * k
+        v = (texels.v[seen] + texels.shift_v[seen]) / wave_v + 5.7 * k
+        total[seen] += amplitude * weight[seen] * value_noise(u, v)
     return total
 
 
@@ -437,8 +429,7 @@ def _fence(texels: Texels, colours: Float32Array, parameters: Float32Array) -> F
 
 def _take(texels: Texels, chosen: NDArray[np.int64]) -> Texels:
     """Some of the texels."""
-    t = texels
-    return Texels(t.u[chosen], t.v[chosen], t.u_size[chosen], t.v_size[chosen], t.shift[chosen], t.shift_v[chosen])
+    return Texels(*(getattr(texels, field.name)[chosen] for field in fields(Texels)))
 
 
 _SHADERS: dict[Material, Shader] = {

@@ -235,7 +235,8 @@ class _Town:
             length = float(np.linalg.norm(end - start))
             ahead = (end - start) / length
             inward = np.array([-ahead[1], ahead[0]])
-            frame = objects.frame_at(*start, float(np.arctan2(ahead[1], ahead[0])), KERB)
+            angle = float(np.arctan2(ahead[1], ahead[0]))
+            frame = objects.frame_at(start[0], start[1], angle, KERB)
             for _ in range(int(rng.poisson(0.15 * wood * length))):
                 far = 15.0 * rng.random() ** 1.5
                 x, y = start + rng.uniform(0.0, length) * ahead + far * inward

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from slam.simulation.optics import pixel_rays
 
 from slam.geometry import se3
 from slam.simulation.geometry import FLAT, Material, Soup
 from slam.simulation.options import SimulationOptions
+from slam.simulation.sensors import pixel_rays
 from slam.simulation.street import SimulatedStreet
 from slam.simulation.surface import Surface, place_rays
 from slam.simulation.variety import draw_variety

@@ -111,7 +111,7 @@ class DriveLabels:
                 f"the teacher's label {path} is damaged or missing: delete it and start again ({error})"
             ) from error
 
-    def measure_poses(self, weights: str, progress: Progress) -> None:
+    def measure_poses(self, weights: str) -> None:
         """Run the SLAM system on the drive and keep its poses."""
         recording = self.recording
         # in order and at full size, which `Video` is not made for
@@ -126,8 +126,7 @@ class DriveLabels:
             cv2.imwrite(str(placed), frames.read(recording.start + index)[..., ::-1])
             return placed
 
-        named = (recording.frames_name, len(recording), recording.camera)
-        T_world_camera = drive_poses(*named, put_image, weights, progress)
+        T_world_camera = drive_poses(recording.frames_name, len(recording), recording.camera, put_image, weights)
         write_atomically(self.weights_file, lambda path: path.write_text(weights))
         self.keep_poses(T_world_camera)
 
@@ -302,8 +301,9 @@ class ManyViewTeacher:
                     f"{drive.folder} holds not all labels of many views that are wanted: prepare the data again with "
                     "this teacher and this size of the networks"
                 )
-        for drive in without:
-            drive.measure_poses(weights, progress)
+        for done, drive in enumerate(without):
+            progress("teacher: poses", done, len(without))
+            drive.measure_poses(weights)
         if self.measures == "poses":
             return
         tasks = [(drive, chunk) for drive in drives for chunk in _missing(drive, sources)]

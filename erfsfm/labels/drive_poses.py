@@ -6,7 +6,6 @@ The networks' package does not import the SLAM system: what goes between them ar
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,6 @@ import yaml
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import TrainingError
-from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.pinhole import Pinhole
 
 FPS = 10.0
@@ -28,12 +26,7 @@ SETTINGS = ("mapping.enabled=false", "output.report=false")
 
 
 def drive_poses(
-    name: str,
-    count: int,
-    camera: Pinhole,
-    put_image: Callable[[int, Path], Path],
-    weights: str,
-    progress: Progress = silent,
+    name: str, count: int, camera: Pinhole, put_image: Callable[[int, Path], Path], weights: str
 ) -> NDArray[np.float64]:
     """Run the SLAM system on a drive.
 
@@ -43,7 +36,6 @@ def drive_poses(
         camera: of the images.
         put_image: makes the image of a frame appear at the path given without suffix, and returns the file.
         weights: of the networks that the system uses.
-        progress: told of the frames that are done.
 
     Returns:
         ``T_world_camera`` ``(count, 4, 4)``, translations in heights of the camera over the road.
@@ -62,8 +54,9 @@ def drive_poses(
         command += ["--weights", weights, "--device", "cpu", "--json"]
         for setting in SETTINGS:
             command += ["--set", setting]
-        code, reason = _run(command, lambda done: progress(f"teacher: poses of {name}", done, count))
-        if code != 0 or not (output / TRAJECTORY).is_file():
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0 or not (output / TRAJECTORY).is_file():
+            reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
             raise TrainingError(f"the teacher's poses of {name} could not be found: {reason}")
         rows = np.loadtxt(output / TRAJECTORY).reshape(-1, 3, 4)
         mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
@@ -73,18 +66,3 @@ def drive_poses(
     T_world_camera[:, :3] = rows
     T_world_camera[:, :3, 3] /= CAMERA_HEIGHT_M
     return T_world_camera
-
-
-def _run(command: list[str], tell: Callable[[int], None]) -> tuple[int, str]:
-    """Exit code and last line on stderr of a command; tells how many frames are done as it says so."""
-    last = "no message"
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
-        assert run.stderr is not None
-        try:
-            for line in run.stderr:
-                last = line.strip() or last
-                if frames := re.match(r"frames: (\d+) of ", line):
-                    tell(int(frames[1]))
-            return run.wait(), last
-        finally:
-            run.kill()

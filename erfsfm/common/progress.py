@@ -51,6 +51,14 @@ def progress_lines(write: Callable[[str], object], every_s: float = _EVERY_S) ->
         thread.join()
 
 
+def duration(seconds: int) -> str:
+    """A time in words, to two units at most."""
+    minutes, hours = seconds // 60, seconds // 3600
+    if hours >= 48:
+        return f"{hours / 24:.1f} days"
+    return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {seconds % 60} s"
+
+
 class _Lines:
     def __init__(self) -> None:
         self.stage = ""
@@ -67,16 +75,8 @@ class _Lines:
         text = f"{self.stage}: {self._done} of {self._total}"
         if done <= 0 or spent_s <= 0 or self._done >= self._total:
             return f"{text} after {spent_s:.0f} s"
-        return f"{text}, {done / spent_s:.2g} a second, {duration((self._total - self._done) * spent_s / done)} left"
-
-
-def duration(seconds: float) -> str:
-    """As minutes and seconds, from two hours on in hours, from two days on in days."""
-    if seconds >= 2 * 86400:
-        return f"{seconds / 86400:.1f} days"
-    if seconds >= 2 * 3600:
-        return f"{seconds / 3600:.1f} hours"
-    return f"{round(seconds) // 60} min {round(seconds) % 60} s"
+        left_s = round((self._total - self._done) * spent_s / done)
+        return f"{text}, {done / spent_s:.2g} a second, {duration(left_s)} left"
 
 
 @contextmanager

@@ -41,5 +41,5 @@ class StepProgress(Callback):
         if timed and step > first and not self._said:
             self._said = True
             took_s = (now_s - began_s) / (step - first)
-            logger.info("a step takes %.2g s, all %d steps take %s", took_s, steps, duration(steps * took_s))
+            logger.info("a step takes %.2g s, all %d steps take %s", took_s, steps, duration(round(steps * took_s)))
         self._progress(f"steps, loss {module.loss:.4g}", step, steps)

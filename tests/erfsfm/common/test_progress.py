@@ -29,7 +29,7 @@ def test_lines_say_what_is_done_how_fast_and_the_time_left() -> None:
     assert lines[-1].startswith("loops: 0 of 1 after "), "said while one item takes long"
 
 
-@pytest.mark.parametrize(("seconds", "words"), [(68, "1 min 8 s"), (9000, "2 h 30 min"), (420_000, "4.9 days")])
+@pytest.mark.parametrize(("seconds", "words"), [(68, "1 min 8 s"), (9000, "2 h 30 min"), (432_000, "5.0 days")])
 def test_long_times_are_said_in_hours_and_days(seconds: int, words: str) -> None:
     assert duration(seconds) == words
 

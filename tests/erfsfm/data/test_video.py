@@ -70,7 +70,7 @@ def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path: Path, monkeyp
     whole = Recording("folder/a", (video.path,) * len(video), Camera(48, 32, 40.0, 40.0, 23.5, 15.5), video)
     numbers: list[int] = []
 
-    def drive_poses(name: str, count: int, camera: Camera, put_image: Callable[..., Path], *_: object) -> np.ndarray:
+    def drive_poses(name: str, count: int, camera: Camera, put_image: Callable[..., Path], weights: str) -> np.ndarray:
         images = [cv2.imread(str(put_image(index, tmp_path / f"{index}"))) for index in range(count)]
         numbers.extend(number(image) for image in images if image is not None)
         return np.tile(np.eye(4), (count, 1, 1))

@@ -340,7 +340,7 @@ def test_a_non_finite_loss_stops_the_run(alone: Configure, tmp_path: Path, monke
         return original(self, batch, index)
 
     monkeypatch.setattr(SelfSupervision, "training_step", poisoned)
-    with pytest.raises(TrainingError, match=r"step 3.* photometric nan"):
+    with pytest.raises(TrainingError, match=r"step 3.*photometric nan"):
         train(alone(), tmp_path / "run", device="cpu")
     assert load_model(tmp_path / "run" / "last").record.step == 3, "the weights so far"
     assert all(torch.isfinite(tensor).all() for tensor in weights_of(tmp_path / "run" / "last"))

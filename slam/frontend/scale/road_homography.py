@@ -41,7 +41,7 @@ _NEAR_RELATIVE_SIGMA = 0.1  # from the short strip
 _RELATIVE_SIGMA = 0.06
 _POINTS = 2500  # approximate number of aligned pixels
 _MIN_POINTS = 300  # least number of aligned pixels of a measurement
-_TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the usual direction of motion, degrees
+_TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees
 _MAX_TILT_DEG = 4.0  # largest tilt of the ground plane, degrees
 _MIN_CORRELATION = 0.3  # least correlation of the aligned pixels
 _MIN_GAIN = 0.25  # least fraction of the photometric error without motion that the alignment removes
@@ -65,17 +65,10 @@ class RoadStep:
         """Length of the step, in camera heights."""
         return float(np.linalg.norm(self.plane))
 
-    def along(self, direction: FloatArray, tilt_sigma_deg: float) -> RoadStep:
-        """The same where a car goes in a ``direction`` ``(3,)`` of the later camera.
-
-        Its road is parallel to that but for a tilt, with a sigma of ``tilt_sigma_deg`` degrees.
-        """
-        normal = _normal_along(direction)
-        return replace(self, plane=_solved(self.information, self.right, normal, self.length_heights, tilt_sigma_deg))
-
-    def scaled(self, factor: float) -> RoadStep:
-        """The same with a length ``factor`` times as large."""
-        return replace(self, plane=factor * self.plane)
+    def along(self, direction: FloatArray) -> RoadStep:
+        """The same where a car goes in a ``direction`` ``(3,)`` of the later camera, parallel to its road."""
+        plane = _solved(self.information, self.right, _normal_along(direction), self.length_heights)
+        return replace(self, plane=plane)
 
 
 class RoadHomography:
@@ -215,8 +208,7 @@ class RoadHomography:
             weighted = strip.rays * (slope / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2)))
             information = ((weighted * slope) @ strip.rays.T).astype(np.float64)
             right = information @ plane - weighted @ residual
-            length = float(np.linalg.norm(plane))
-            last, plane = plane, _solved(information, right, expected, length, _TILT_SIGMA_DEG)
+            last, plane = plane, _solved(information, right, expected, float(np.linalg.norm(plane)))
             if np.abs(plane - last).max() < _CONVERGED * np.linalg.norm(plane):
                 break
         correlation = _correlation(strip.local(grey), strip.local(seen))
@@ -286,12 +278,10 @@ def _normal_along(direction: FloatArray) -> FloatArray:
     return np.asarray(normal / np.linalg.norm(normal))
 
 
-def _solved(
-    information: FloatArray, right: FloatArray, normal: FloatArray, length: float, tilt_sigma_deg: float
-) -> FloatArray:
+def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, length: float) -> FloatArray:
     """The plane ``m`` ``(3,)`` of normal equations and an expected normal, at about that length."""
     across = np.eye(3) - np.outer(normal, normal)
-    prior = across / (np.deg2rad(tilt_sigma_deg) * length) ** 2
+    prior = across / (np.deg2rad(_TILT_SIGMA_DEG) * length) ** 2
     return np.asarray(np.linalg.solve(information + prior + 1e-9 * np.eye(3), right))
 
 

@@ -2,9 +2,8 @@
 
 A car pitches on its springs, by which a length errs by 7 to 8 % a degree, and the images of the road tell its pitch
 poorly. Single directions of motion tell it poorly too, for the camera also rises and falls. Over eight metres around a
-frame the path is parallel to the road; where directions are noisy, it is so only on the average of many steps. What
-path and images disagree on for a hundred steps is as much the error of either: of small and equal errors of all
-directions, or of a road that is no plane (``docs/design/scale-and-lengths.md``).
+frame the path is parallel to the road; where directions are noisy, it is so only on the average of many steps
+(``docs/design/scale-and-lengths.md``).
 """
 
 from __future__ import annotations
@@ -23,9 +22,6 @@ _REACH_HEIGHTS = 2.5  # of the path before and after a frame, in camera heights:
 _USUAL_STEPS = 101  # whose median direction is the usual one
 _PITCH_SIGMA_DEG = 0.3  # of a car against its usual pitch, degrees
 _OF_PATH = 0.5  # noise of the path's direction over that of a single step
-_TILT_SIGMA_DEG = 0.04  # of the road against the path, from step to step
-_FREE_TILT_SIGMA_DEG = 0.25  # where the images are asked
-_OF_IMAGES = 0.5  # their share in what they and the path disagree on for many steps
 
 
 def with_slope(road_steps: Mapping[Ends, RoadStep], steps: StepTable) -> dict[Ends, RoadStep]:
@@ -39,19 +35,15 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: StepTable) -> dict[En
     if not motions:
         return dict(road_steps)
     ratios = [motion.length_unscaled / road_steps[ends].length_heights for ends, motion in motions.items()]
-    directions = _path_directions(steps, _REACH_HEIGHTS * float(np.median(ratios)))
+    by_path = _path_directions(steps, _REACH_HEIGHTS * float(np.median(ratios)))
     T_current_previous = invert(np.array([motion.relative_pose.T_from_to for motion in motions.values()]))
     own = -T_current_previous[:, :3, 3] / np.linalg.norm(T_current_previous[:, :3, 3], axis=1, keepdims=True)
     usual = np.column_stack([running_median(axis, _USUAL_STEPS) for axis in own.T])
-    around = np.array([directions.get(ends[1], often) for ends, often in zip(motions, usual, strict=True)])
+    around = np.array([by_path.get(ends[1], often) for ends, often in zip(motions, usual, strict=True)])
     noise = _OF_PATH * mad_sigma((own - around)[:, 1])
     share = 1.0 / (1.0 + (noise / np.deg2rad(_PITCH_SIGMA_DEG)) ** 2)
-    measured = list(zip(motions, usual + share * (around - usual), strict=True))
-    by_path = [road_steps[ends].along(direction, _TILT_SIGMA_DEG) for ends, direction in measured]
-    by_images = [road_steps[ends].along(direction, _FREE_TILT_SIGMA_DEG) for ends, direction in measured]
-    apart = [np.log(free.length_heights / step.length_heights) for free, step in zip(by_images, by_path, strict=True)]
-    factors = np.exp(_OF_IMAGES * running_median(np.array(apart), _USUAL_STEPS))
-    return {**road_steps, **{ends: step.scaled(f) for ends, step, f in zip(motions, by_path, factors, strict=True)}}
+    directions = zip(motions, usual + share * (around - usual), strict=True)
+    return {**road_steps, **{ends: road_steps[ends].along(direction) for ends, direction in directions}}
 
 
 def _path_directions(steps: StepTable, reach: float) -> dict[int, FloatArray]:

@@ -21,11 +21,12 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from shared.command import markdown, one_line_errors, parser_of
+from shared.command import one_line_errors, parser_of
 
 from erfsfm.common.errors import ConfigError, TrainingError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress, duration, progress_bar, silent
+from erfsfm.common.table import Table
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.snippets import split_recordings
@@ -141,7 +142,7 @@ def tables(rows: Sequence[Row], results: dict[str, Results]) -> str:
             if bool(row.scale) == of_depth:
                 start = [f"`{row.training}`", row.scale or "each snippet's"]
                 lines += [[*start, "paper", *row.figures], [*start, "ours", *ours(row, results.get(row.training, {}))]]
-        parts += [markdown(["training", "scale", "by", *head.split(" | ")], lines)] if lines else []
+        parts += [Table(["training", "scale", "by", *head.split(" | ")], lines, names=3).markdown()] if lines else []
     return "\n\n".join(parts) + "\n"
 
 
@@ -191,8 +192,12 @@ def main(words: Sequence[str] | None = None) -> None:
                 training.run(options.device, progress)
             results[training.name] = training.evaluate(options.kitti, options.raw, options.split, options.device)
             text = tables(rows, results)
-            write_atomically(options.output / "tables.md", lambda path, text=text: path.write_text(text))
+            _write(options.output / "tables.md", text)
     print(text)
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 if __name__ == "__main__":

@@ -186,8 +186,9 @@ def _T_body_sensor(path: Path) -> FloatArray:
 
 
 def _freiburg(focal: tuple[float, float], centre: tuple[float, float], *distortion: float) -> CameraFile:
-    keys = {"width": 640, "height": 480, "fx": focal[0], "fy": focal[1], "cx": centre[0], "cy": centre[1], "fps": 30.0}
-    return CameraFile(**keys, model="opencv" if distortion else "pinhole", distortion=distortion)
+    (fx, fy), (cx, cy) = focal, centre
+    camera = CameraFile(width=640, height=480, fx=fx, fy=fy, cx=cx, cy=cy, fps=30.0)
+    return camera.model_copy(update={"model": "opencv", "distortion": distortion}) if distortion else camera
 
 
 # the benchmark's table of its three cameras; images of freiburg3 are undistorted

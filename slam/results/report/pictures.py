@@ -98,7 +98,7 @@ def _joined(first: Image, second: Image, from_: NDArray[np.float32], to: NDArray
     starts = from_ * (_WIDTH_PX / first.shape[1])
     ends = to * (_WIDTH_PX / second.shape[1]) + ([0, left.shape[0]] if wide else [_WIDTH_PX, 0])
     for k, line in enumerate(np.rint(np.stack([starts, ends], axis=1)).astype(int).tolist()):
-        cv2.line(joined, *line, _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
+        cv2.line(joined, line[0], line[1], _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
         for place in line:
             cv2.circle(joined, place, 2, _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
     return joined

@@ -33,7 +33,7 @@ from erfsfm.labels.many_views import NEIGHBOURS, label
 from erfsfm.labels.refined_depth import in_camera_heights, refined_label
 from erfsfm.labels.structure import TeacherStructure
 from erfsfm.mvs.flow import Grey, measure
-from erfsfm.mvs.neighbours import neighbours_around
+from erfsfm.mvs.views import neighbours_around
 
 VERSION = 2
 # pixels of the images that are measured: finer flow is slower and no surer; twice the networks' width would shift

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.common.readers.folder import image_folder, recording_name
-from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.images import image_folder, list_images, recording_name
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError

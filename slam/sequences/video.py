@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.common.readers.folder import clip_name, video_name
-from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos
+from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, clip_name, list_videos, video_name
 from slam.geometry.se3 import FloatArray
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.loader import Asked, Loader, Opener

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from erfsfm.common.figure_file import save_figure
+from erfsfm.common.files import save_figure
 from erfsfm.common.readers.camera_file import CameraFile
 from slam.commands.calibration.solve import Calibration
 from slam.sequences.images import ImageSource

@@ -9,11 +9,10 @@ import numpy as np
 import yaml
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.figure_file import require_figure
+from erfsfm.common.files import require_figure
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
-from erfsfm.common.readers.folder import image_folder
-from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.images import image_folder, list_images
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames
 from slam.commands.calibration.board import Board

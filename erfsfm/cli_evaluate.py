@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from erfsfm.cli_options import Device, Fidelity, Json, UnusedSeed, Weights, print_rows
+from erfsfm.cli_options import Device, Fidelity, Json, ManyWeights, UnusedSeed, Weights, print_rows
 
 evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of trained networks.")
 
@@ -18,9 +18,7 @@ def evaluate_depth(
     dataset: Annotated[
         list[Path], typer.Option(help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat")
     ],
-    weights: Annotated[
-        list[str], typer.Option(help="a shipped name (default, sim) or a training output folder; repeat to compare")
-    ] = ["default"],  # noqa: B006
+    weights: ManyWeights = ["default"],  # noqa: B006
     truth: Annotated[
         Literal["measured", "many-views"],
         typer.Option(help="many-views: measured by optical flow at the poses of a run, for drives without true depth"),

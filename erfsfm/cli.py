@@ -133,7 +133,7 @@ def receptive_field(
 
     from erfsfm.checkpoint import load_model
     from erfsfm.common.errors import DataError
-    from erfsfm.common.figure_file import require_figure
+    from erfsfm.common.files import require_figure
     from erfsfm.common.readers.images import list_images, resize_image
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from erfsfm.cli_options import Device, Fidelity, Json, UnusedSeed, Weights, print_rows
+from erfsfm.cli_options import Device, Fidelity, Json, ManyWeights, UnusedSeed, Weights, print_rows
 
 evaluate_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Depth and pose errors of trained networks."
@@ -20,9 +20,7 @@ def evaluate_depth(
     dataset: Annotated[
         list[Path], typer.Option(help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat")
     ],
-    weights: Annotated[
-        list[str], typer.Option(help="a shipped name (default, sim) or a training output folder; repeat to compare")
-    ] = ["default"],  # noqa: B006
+    weights: ManyWeights = ["default"],  # noqa: B006
     truth: Annotated[
         Literal["measured", "many-views"],
         typer.Option(help="many-views: measured by optical flow at the poses of a run, for drives without true depth"),
@@ -65,19 +63,17 @@ def evaluate_depth(
         raise ConfigError("--sequence and --cache belong to --truth many-views")
     if fidelity == "paper" and split is None:
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
-    if len(dataset) > 1 and (truth == "many-views" or split is not None):
-        raise ConfigError(f"--split and --truth many-views take one --dataset; got {len(dataset)}")
-    if len(weights) > 1 and (truth == "many-views" or split is not None):
-        raise ConfigError(f"--split and --truth many-views take one --weights; got {len(weights)}")
-    networks = {name: DepthPosePredictor.from_weights(name, device) for name in weights}
-    predictor = networks[weights[0]]
+    if max(len(dataset), len(weights)) > 1 and (truth == "many-views" or split is not None):
+        raise ConfigError("--split and --truth many-views take one --dataset and one --weights")
+    names = weights if len(weights) > 1 else ["networks"]
+    networks = {name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)}
     with progress_bar() as show:
         if truth == "many-views":
-            rows = many_view_protocol(predictor, dataset[0], sequence or (), cache, allow_leak, show)
+            rows = many_view_protocol(networks["networks"], dataset[0], sequence or (), cache, allow_leak, show)
         elif split is None:
-            rows = depth_protocol(networks if len(networks) > 1 else {"networks": predictor}, dataset, allow_leak, show)
+            rows = depth_protocol(networks, dataset, allow_leak, show)
         else:
-            rows = eigen_protocol(predictor, dataset[0], split, fidelity, allow_leak)
+            rows = eigen_protocol(networks["networks"], dataset[0], split, fidelity, allow_leak)
     _show(rows, output, as_json)
 
 

@@ -13,6 +13,9 @@ Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to c
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
 UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")]
 Weights = Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output folder")]
+ManyWeights = Annotated[
+    list[str], typer.Option(help="a shipped name (default, sim) or a training output folder; repeat to compare")
+]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 Fidelity = Annotated[Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")]
 

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and are read up to a limit; folders that one process at a time writes to."""
+"""Files that appear whole or not at all and are read up to a limit, figures, and folders that one process writes to."""
 
 from __future__ import annotations
 
@@ -10,12 +10,23 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from erfsfm.common.errors import BusyError
+from erfsfm.common.errors import BusyError, ConfigError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAX_TEXT_BYTES = 256 * 2**20  # a trajectory of a million frames
 MAX_IMAGE_BYTES = 2**30
 _PARTIAL = re.compile(r"\.\d+\.\d+\.partial\.(?P<name>.+)")
+_FIGURE_MARK = "erfsfm"
+_FIGURE_METADATA: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": _FIGURE_MARK},
+    ".pdf": {"Creator": _FIGURE_MARK, "CreationDate": None},
+    ".svg": {"Creator": _FIGURE_MARK, "Date": None},
+}
+FIGURE_SUFFIXES = tuple(_FIGURE_METADATA)
 
 
 def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = True) -> None:
@@ -88,6 +99,30 @@ def unfinished_name(path: Path) -> str | None:
 def _sync(path: Path) -> None:
     with path.open("r+b") as file:
         os.fsync(file.fileno())
+
+
+def require_figure(path: Path) -> None:
+    """Check that a figure may be written there, before it is drawn.
+
+    Raises:
+        ConfigError: another format, or a file that no figure of ours is.
+    """
+    if path.suffix.lower() not in FIGURE_SUFFIXES:
+        raise ConfigError(f"figures are written as {', '.join(FIGURE_SUFFIXES)}; got '{path.name}'")
+    if path.is_file() and _FIGURE_MARK.encode() not in path.read_bytes():
+        raise ConfigError(f"{path} exists and is no figure of erfsfm: choose another --output, or remove it")
+
+
+def save_figure(figure: Figure, path: Path, dpi: int) -> None:
+    """Write a figure in the format of its name; equal figures are equal files.
+
+    Raises:
+        ConfigError, OSError: it may not or cannot be written.
+    """
+    require_figure(path)
+    suffix = path.suffix.lower()
+    metadata = _FIGURE_METADATA[suffix]
+    write_atomically(path, lambda part: figure.savefig(part, format=suffix[1:], dpi=dpi, metadata=metadata))
 
 
 class FolderLock(ExitStack):

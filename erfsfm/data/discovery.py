@@ -10,8 +10,7 @@ from pathlib import Path
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
-from erfsfm.common.readers.folder import image_folder, recording_name, video_name
-from erfsfm.common.readers.images import first_size, list_images
+from erfsfm.common.readers.images import first_size, image_folder, list_images, recording_name
 from erfsfm.common.readers.kitti_calibration import CAM_TO_CAM, ODOMETRY_CALIBRATION, CalibrationFile
 from erfsfm.common.readers.kitti_drives import (
     ODOMETRY_CAMERAS,
@@ -22,7 +21,7 @@ from erfsfm.common.readers.kitti_drives import (
     find_odometry_root,
 )
 from erfsfm.common.readers.numbering import by_name, by_number
-from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos
+from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos, video_name
 from erfsfm.data.prepared import INDEX_FILE, read_prepared
 from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.data.video import Video

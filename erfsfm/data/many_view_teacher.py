@@ -33,7 +33,7 @@ from erfsfm.labels.many_views import NEIGHBOURS, label
 from erfsfm.labels.refined_depth import in_camera_heights, refined_label, shrunk
 from erfsfm.labels.structure import TeacherStructure
 from erfsfm.mvs.flow import Grey, measure
-from erfsfm.mvs.neighbours import neighbours_around
+from erfsfm.mvs.views import neighbours_around
 
 VERSION = 3
 # pixels of the images that flow alone measures: finer flow is slower and no surer; twice the networks' width would

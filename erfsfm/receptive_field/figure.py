@@ -13,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from erfsfm.common.figure_file import save_figure
+from erfsfm.common.files import save_figure
 from erfsfm.receptive_field.measure import HELD, FieldRow
 
 _WIDTH_IN = 12.0

@@ -19,8 +19,7 @@ from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.mvs.evidence import CHANGE, CHANNELS, FULL_SIZE
-from erfsfm.mvs.fusion import FILE, STEP
+from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP
 from erfsfm.networks.fusion_net import LEVELS, FusionNet
 from erfsfm.networks.torch_network import exported
 from erfsfm.training.fusion_samples import FusionSamples, Sample

@@ -16,8 +16,8 @@ from erfsfm.data.weather import weathered
 from erfsfm.inference import DepthPosePredictor, depth_at
 from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.fusion import evidence
-from erfsfm.mvs.neighbours import BASELINES, neighbours
 from erfsfm.mvs.refine import measure
+from erfsfm.mvs.views import BASELINES, neighbours
 
 WIDTH = 416
 CROP = (64, 144)  # of the evidence

@@ -24,7 +24,7 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from erfsfm.checkpoint import KINDS, load_model
+from erfsfm.checkpoint import KINDS, load_model, take_over
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.progress import Progress, silent
@@ -37,7 +37,6 @@ from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.inference import choose_device
-from erfsfm.networks.transfer import take_over
 from erfsfm.training.keeper import Average, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses

@@ -12,10 +12,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.figure_file import require_figure, save_figure
+from erfsfm.common.files import require_figure, save_figure
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
-from erfsfm.common.readers.folder import image_folder
+from erfsfm.common.readers.images import image_folder
 from erfsfm.common.readers.images import list_images
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames

@@ -14,8 +14,7 @@ from scipy.spatial.distance import cdist
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
-from erfsfm.common.readers.folder import image_folder
-from erfsfm.common.readers.images import list_images, read_image
+from erfsfm.common.readers.images import image_folder, list_images, read_image
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
 from slam.config.sections import LoopsConfig, load_stored

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.neighbours import neighbours_around
+from erfsfm.mvs.views import neighbours_around
 from erfsfm.mvs.refine import Decide, RefinedDepth, measure
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Image, Intrinsics

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.common.readers.folder import clip_name, image_folder, recording_name, video_name
+from erfsfm.common.readers.images import image_folder, recording_name
+from erfsfm.common.readers.video import clip_name, video_name
 from erfsfm.common.readers.images import list_images
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos

@@ -22,6 +22,7 @@ Image = NDArray[np.uint8]
 T = TypeVar("T")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+IMAGE_FOLDERS = ("images", "image_2", "image_02", "image_0", "image_00", "rgb", "data")  # never a name of a drive
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _JPEG_SEGMENT = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)  # begins one with a length, or is the end
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
@@ -50,6 +51,27 @@ def list_images(folder: Path) -> list[Path]:
 def has_images(folder: Path) -> bool:
     """Whether a folder holds an image file, without listing all of it."""
     return folder.is_dir() and any(is_image(path) for path in folder.iterdir())
+
+
+def image_folder(folder: Path) -> Path | None:
+    """The folder that holds the images: itself, or its one sub-folder of a usual name.
+
+    Raises:
+        DataError: several sub-folders qualify.
+    """
+    if has_images(folder):
+        return folder
+    found = [folder / name for name in IMAGE_FOLDERS if has_images(folder / name)]
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise DataError(f"{folder} has images in {names}: give one of these folders as --dataset")
+    return found[0] if found else None
+
+
+def recording_name(folder: Path) -> str:
+    """The folder's name, or its parent's where the folder is only called ``images`` or the like."""
+    folder = folder.absolute()
+    return folder.parent.name if folder.name in IMAGE_FOLDERS and folder.parent.name else folder.name
 
 
 def is_image(path: Path) -> bool:

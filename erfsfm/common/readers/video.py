@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import Image
+from erfsfm.common.readers.images import Image, recording_name
 
 logger = logging.getLogger(__name__)
 
@@ -158,6 +158,19 @@ def list_videos(folder: Path) -> list[Path]:
     """The video files directly in a folder, without hidden ones."""
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
     return sorted(path for path in visible if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+
+
+def video_name(video: Path) -> str:
+    """The name of the folder, as `recording_name`; of one of several videos its own name, too: ``my_drive/clip2``."""
+    folder = video.absolute().parent
+    name = recording_name(folder)
+    return f"{name}/{clip_name(video)}" if len(list_videos(folder)) > 1 else name
+
+
+def clip_name(video: Path) -> str:
+    """The name of a video in its folder: without its suffix, unless another one differs from it in that alone."""
+    stems = [path.stem for path in list_videos(video.absolute().parent)]
+    return video.stem if stems.count(video.stem) < 2 else video.name
 
 
 def _capture(path: Path) -> cv2.VideoCapture:

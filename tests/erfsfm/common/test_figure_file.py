@@ -10,10 +10,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from erfsfm.common.errors import ConfigError
-from erfsfm.common.figure_file import SUFFIXES, save_figure
+from erfsfm.common.files import FIGURE_SUFFIXES, save_figure
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", FIGURE_SUFFIXES)
 def test_a_figure_replaces_a_figure_and_equal_ones_are_equal_files(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"figure{suffix}"
     if suffix != ".svg":  # its ids are random without the style of our plots

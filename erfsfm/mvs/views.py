@@ -1,17 +1,24 @@
-"""Which views of a drive measure the depth of one of them: about as far away as gives parallax, and turned little."""
+"""Geometry of views: which of a drive measure the depth of one of them, and where the pixels of one lie in another.
+
+A view that measures is about as far away as gives parallax, and turned little.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from erfsfm.mvs.appearance import Array
 
 BASELINES = (0.07, 0.2)  # wanted distances over the median depth
 _RANGE = 2.5  # accepted factor on these
 _LARGEST_TURN_DEG = 20.0
 _MOST_NEIGHBOURS = 3
 _MAX_FRAMES_APART = 40
+LEAST_Z = 1e-3
 
 
 def neighbours(T_world_camera: NDArray[np.float64], target: int, wanted: Iterable[float]) -> list[int]:
@@ -55,3 +62,35 @@ def neighbours_around(
     wanted = [sign * baseline * median_depth for sign in (1, -1) for baseline in BASELINES]
     chosen = neighbours(T_world_camera[near], target - int(near[0]), wanted)
     return sorted(int(near[row]) for row in chosen[:_MOST_NEIGHBOURS])
+
+
+class Projection:
+    """``K (R p + d t)`` for all pixels p of an image, with the rotated rays computed once."""
+
+    def __init__(
+        self, K: NDArray[np.floating], T_neighbour_target: NDArray[np.floating], height: int, width: int
+    ) -> None:
+        H = (K @ T_neighbour_target[:3, :3] @ np.linalg.inv(K)).astype(np.float32)
+        u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+        self._rotated = [H[row, 0] * u + H[row, 1] * v + H[row, 2] for row in range(3)]  # (H, W) each
+        self._moved = (K @ T_neighbour_target[:3, 3]).astype(np.float32)
+
+    def pixels(self, inverse_depth: Array) -> tuple[Array, Array, Array]:
+        """Columns, rows and z over the depth, ``(H, W)`` each."""
+        x, y, z = (cv2.scaleAdd(inverse_depth, float(m), r) for r, m in zip(self._rotated, self._moved, strict=True))
+        z = cv2.max(z, LEAST_Z)
+        return x / z, y / z, z
+
+    def motion(self, u: Array, v: Array, z: Array, inverse_depth: Array) -> tuple[Array, Array]:
+        """Derivatives of columns and rows with respect to the logarithm of the inverse depth."""
+        k = inverse_depth / z
+        moved = self._moved
+        return (moved[0] - u * moved[2]) * k, (moved[1] - v * moved[2]) * k
+
+
+def halved(K: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The camera matrix of an image of half the size; pixel centres are at integers."""
+    half = np.array(K, dtype=np.float64)
+    half[:2] *= 0.5
+    half[:2, 2] -= 0.25
+    return half

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from erfsfm.mvs.projection import Projection, halved
+from erfsfm.mvs.views import Projection, halved
 
 K = np.array([[90.0, 0.0, 15.0], [0.0, 80.0, 9.0], [0.0, 0.0, 1.0]])
 

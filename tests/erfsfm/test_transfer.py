@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from erfsfm.checkpoint import take_over
 from erfsfm.common.errors import ConfigError
 from erfsfm.networks.presets import build
-from erfsfm.networks.transfer import take_over
 
 
 def made(name: str, width: float = 0.25, seed: int = 0) -> torch.nn.Module:

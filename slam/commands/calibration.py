@@ -15,8 +15,7 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.files import require_figure, save_figure
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
-from erfsfm.common.readers.images import image_folder
-from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.images import image_folder, list_images
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames
 from slam.commands.board import FEWEST_VIEWS, Board, View, chosen_views, find_views

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.common.readers.images import image_folder, recording_name
-from erfsfm.common.readers.video import clip_name, video_name
-from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.images import image_folder, list_images, recording_name
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
-from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos
+from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, clip_name, list_videos, video_name
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file

@@ -102,7 +102,7 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
     "name, old, new, message",
     [
         ("sensor.yaml", "radial-tangential", "omni", "omni is unknown: known are .*give --camera"),
-        ("sensor.yaml", "resolution: [", "size: [", "key width is missing"),
+        ("sensor.yaml", "resolution:", "size:", "lacks .resolution"),
         ("sensor.yaml", "[30, 30, 20, 12]", "[30, 30, 200, 12]", r"sensor\.yaml: cx, cy: \(200, 12\) lies outside"),
         ("sensor.yaml", "T_BS", "T_SB", "needs T_BS with data of 4 x 4 numbers"),
         ("sensor.yaml", "rate_hz: 20", "rate_hz: !!python/object/apply:os.getcwd []", "could not determine"),

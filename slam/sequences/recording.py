@@ -309,7 +309,10 @@ def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     period = float(np.median(np.diff(times) / np.diff(rows)))
     reach = np.array([-len(stamps), len(stamps)])  # at both ends the rate goes on
     times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
-    return np.interp(np.arange(1, len(stamps) + 1), np.r_[rows[0] + reach[0], rows, rows[-1] + reach[1]], times)
+    mended: FloatArray = np.interp(
+        np.arange(1, len(stamps) + 1), np.r_[rows[0] + reach[0], rows, rows[-1] + reach[1]], times
+    )
+    return mended
 
 
 def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:

@@ -57,13 +57,6 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(
         open_sequence(tmp_path, frames="1:4").frame(1)
 
 
-def test_a_gap_under_a_lens(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path, ["0.png", "1.png", "3.png", "4.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n")
-    with pytest.raises(MissingFrameError):
-        open_sequence(tmp_path).frame(2)
-
-
 @pytest.mark.parametrize("fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"])
 def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int) -> None:
     images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
@@ -88,17 +81,6 @@ def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: st
     images(tmp_path, [form.format(1403715273 + each // 10**6, each % 10**6) for each in microseconds])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
     assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx(np.diff(microseconds) / 1e6, abs=1e-6)
-
-
-def test_unlikely_stamps_and_pauses_are_warned_of(
-    tmp_path: Path, images, camera_yaml: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    images(tmp_path, [f"{k}.png" for k in range(4)])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "camera_height_m: 100\n")
-    (tmp_path / "times.txt").write_text("0\n100\n200\n9000\n")
-    open_sequence(tmp_path)
-    assert "its frames are 100 s apart" in caplog.text and "pause for 8800 s before frame 3" in caplog.text
-    assert "camera_height_m is 100" in caplog.text
 
 
 def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:

@@ -1,7 +1,7 @@
 """What people do to trajectories by mistake, found by trying it: the error is then several times smaller.
 
-Clocks that differ, poses of the world in the camera, rows in the reverse order, mirrored or permuted axes, quaternions
-in another order, millimetres.
+Clocks that differ or run faster, poses of the world in the camera, rows in the reverse order, mirrored or permuted
+axes, quaternions in another order, millimetres.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ _LEAST_TURN_DEG = 20.0  # between two orders of axes
 _LONGEST_SHIFT_S, _MOST_SHIFTS, _MOST_POSES = 60.0, 2000, 300
 _LEAST_OVERLAP, _LEAST_POSES = 0.5, 10
 _LEAST_ERROR_DEG = 0.02
+_BETTER_THAN_SHIFT = 1.5  # times, of another rate, which no shift mends
 
 Change = Callable[[FloatArray], FloatArray]
 
@@ -68,10 +69,15 @@ def likely_mistakes(estimate: Trajectory, reference: Trajectory, pair: tuple[Tra
     as_given = _ate(T_estimate, T_reference)
     fits = [(_ate(change(T_estimate), T_reference), words) for words, change in _OF_POSITIONS.items()]
     best, words = min(fits)
-    if estimate.timed and reference.timed:
-        shift_s, unshifted, shifted = _clock(estimate, reference)
+    if estimate.timed == reference.timed:
+        shift, unshifted, shifted = _clock(estimate, reference)
+        has_all_rows = len(estimate) == len(reference)
+        rowwise = _ate(estimate.T_world_camera, reference.T_world_camera) if has_all_rows else np.inf
+        if rowwise * _BETTER < unshifted and rowwise * _BETTER_THAN_SHIFT < shifted and rowwise < best:
+            return [_said("does the clock of one run faster? Row by row, the estimate", unshifted, rowwise)]
         if shifted * _BETTER < unshifted and shifted < best:
-            return [_said(f"a shift of the estimate's stamps by {shift_s:+.2f} s", unshifted, shifted)]
+            by = f"stamps by {shift:+.2f} s" if estimate.timed else f"frame numbers by {shift:+.0f}"
+            return [_said(f"a shift of the estimate's {by}", unshifted, shifted)]
     if as_given > _EXACT * extent and best * _BETTER < as_given:
         return [_said(words, as_given, best)]
     return [*_units(T_estimate, T_reference), *_rotations(T_estimate, T_reference)]
@@ -94,7 +100,7 @@ def _residual(estimate: FloatArray, reference: FloatArray) -> float:
 
 
 def _clock(estimate: Trajectory, reference: Trajectory) -> tuple[float, float, float]:
-    """The shift of the estimate's stamps that fits best, seconds, and the errors without and with it."""
+    """The shift of the estimate's stamps that fits best, seconds or frames, and the errors without and with it."""
     every = max(len(estimate) // _MOST_POSES, 1)
     stamps, positions = estimate.stamps[::every], estimate.positions[::every]
     unmatched = float(np.linalg.norm(np.ptp(reference.positions, axis=0)))

@@ -7,7 +7,7 @@ same layout and bytes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -59,14 +59,8 @@ class Ply:
         return np.full((len(self.vertices), 3), 128, np.uint8) if self.colours is None else self.colours
 
 
-@dataclass
-class _Element:
-    """An element of the header: its name, count, and scalar and list properties."""
-
-    name: str
-    count: int
-    fields: list[tuple[str, str]] = field(default_factory=list)
-    list_types: tuple[str, str] | None = None
+_Element = tuple[str, int, list[tuple[Any, ...]]]
+"""Name, count and fields of an element of the header."""
 
 
 def read_ply(path: Path) -> Ply:
@@ -75,19 +69,16 @@ def read_ply(path: Path) -> Ply:
     Raises:
         RunError: it is no PLY in little-endian form, is cut short, or holds impossible values.
     """
+    parts = _mapped(path)
+    vertices, faces = parts["vertex"], parts.get("face")
     try:
-        with path.open("rb") as file:
-            elements = _header(file)
-            _require_size(path.stat().st_size - file.tell(), elements)
-            parts = {element.name: _read(file, element) for element in elements}
-            if file.read(1):
-                raise ValueError("it is longer than its header states")
-        ply = Ply(parts["vertex"], parts["face"].astype(np.int64) if "face" in parts else None)
+        if faces is not None and (faces["count"] != 3).any():
+            raise ValueError("a face has other than 3 vertices")
+        ply = Ply(np.array(vertices), None if faces is None else faces["vertices"].astype(np.int64))
         _check(ply)
         return ply
-    except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
-        reason = str(error) or "it ends within its header"
-        raise RunError(f"{path} is no PLY that can be read ({reason}): run the sequence again") from error
+    except (ValueError, KeyError) as error:
+        raise RunError(f"{path} is no PLY that can be read ({error}): run the sequence again") from error
 
 
 def map_ply(path: Path) -> tuple[NDArray[np.void], NDArray[np.void]]:
@@ -97,22 +88,33 @@ def map_ply(path: Path) -> tuple[NDArray[np.void], NDArray[np.void]]:
         Structured arrays; the field ``vertices`` of a triangle has its three corners.
 
     Raises:
-        RunError: it is no binary mesh of triangles, or is cut short.
+        RunError: it is no binary mesh, or is shorter or longer than it states.
     """
+    parts = _mapped(path)
+    if "face" not in parts:
+        raise RunError(f"{path} is no mesh: run the sequence again")
+    return parts["vertex"], parts["face"]
+
+
+def _mapped(path: Path) -> dict[str, NDArray[np.void]]:
+    """The elements by name, vertices among them."""
+    parts: dict[str, NDArray[np.void]] = {}
     try:
         with path.open("rb") as file:
-            vertex, face = _header(file)
-            if face.list_types is None:
-                raise ValueError("it is no mesh")
-            count, index = face.list_types
-            start = file.tell()
-        of_vertex = np.dtype(vertex.fields)
-        of_face = np.dtype([("count", count), ("vertices", index, (3,))])
-        vertices = _mapped(path, start, vertex.count, of_vertex)
-        return vertices, _mapped(path, start + vertex.count * of_vertex.itemsize, face.count, of_face)
-    except (OSError, ValueError, KeyError, IndexError, StopIteration) as error:
+            elements, place = _header(file), file.tell()
+        size = path.stat().st_size
+        for name, count, fields in elements:
+            dtype, start = np.dtype(fields), place
+            place += count * dtype.itemsize
+            if not start <= place <= size:
+                raise ValueError(f"it announces {count} elements '{name}', more than it holds")
+            parts[name] = np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
+        if place < size or "vertex" not in parts:
+            raise ValueError("it is longer than its header states, or has no vertices")
+        return parts
+    except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
         reason = str(error) or "it ends within its header"
-        raise RunError(f"{path} is no mesh that can be read ({reason}): run the sequence again") from error
+        raise RunError(f"{path} is no PLY that can be read ({reason}): run the sequence again") from error
 
 
 def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
@@ -188,7 +190,7 @@ def _check(ply: Ply) -> None:
 
 
 def _header(file: BinaryIO) -> list[_Element]:
-    """The elements in their order."""
+    """The elements in their order; of a list as many values as a triangle has corners."""
     lines = _words(file)
     if next(lines) != ["ply"]:
         raise ValueError("it does not begin with 'ply'")
@@ -200,28 +202,14 @@ def _header(file: BinaryIO) -> list[_Element]:
         if words[0] == "end_header":
             break
         if words[0] == "element":
-            elements.append(_Element(words[1], int(words[2])))
+            elements.append((words[1], int(words[2]), []))
         elif words[1] == "list":
-            elements[-1].list_types = (f"<{_TYPES[words[2]]}", f"<{_TYPES[words[3]]}")
+            elements[-1][2].extend([("count", f"<{_TYPES[words[2]]}"), ("vertices", f"<{_TYPES[words[3]]}", (3,))])
         else:
-            elements[-1].fields.append((words[2], f"<{_TYPES[words[1]]}"))
+            elements[-1][2].append((words[2], f"<{_TYPES[words[1]]}"))
     else:
         raise ValueError("its header has no end")
-    if not elements or elements[0].name != "vertex":
-        raise ValueError("its vertices do not come first")
     return elements
-
-
-def _require_size(size: int, elements: list[_Element]) -> None:
-    """Refuse a body that is shorter than announced, before any memory is taken for it."""
-    for element in elements:
-        fields = [kind for _, kind in element.fields]
-        if element.list_types is not None:
-            fields += [element.list_types[0], *[element.list_types[1]] * 3]
-        each = sum(np.dtype(kind).itemsize for kind in fields)
-        if element.count < 0 or element.count * each > size:
-            raise ValueError(f"it announces {element.count} elements '{element.name}', more than it holds")
-        size -= element.count * each
 
 
 def _words(file: BinaryIO) -> Iterator[list[str]]:
@@ -229,26 +217,3 @@ def _words(file: BinaryIO) -> Iterator[list[str]]:
         words = line.decode("ascii").split()
         if words and words[0] not in ("comment", "obj_info"):
             yield words
-
-
-def _read(file: BinaryIO, element: _Element) -> NDArray[Any]:
-    if element.list_types is None:
-        return _records(file, element, np.dtype(element.fields))
-    count_type, index_type = element.list_types
-    faces = _records(file, element, np.dtype([("count", count_type), ("vertices", index_type, (3,))]))
-    if (faces["count"] != 3).any():
-        raise ValueError(f"each {element.name} must have 3 vertices")
-    vertices: NDArray[Any] = faces["vertices"]
-    return vertices
-
-
-def _mapped(path: Path, start: int, count: int, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
-
-
-def _records(file: BinaryIO, element: _Element, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    content = file.read(element.count * dtype.itemsize)
-    if len(content) != element.count * dtype.itemsize:
-        there = len(content) // dtype.itemsize
-        raise ValueError(f"it is cut short: {there} of {element.count} elements '{element.name}' are there")
-    return np.frombuffer(content, dtype)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,13 +68,6 @@ class BadRows:
             line = int(lines[good[late + 1]].min())
             logger.warning("%s: %s are not in order, first on line %d: the rows are sorted", self._path, what, line)
         return good
-
-    def ordered(self, rows: Sequence[tuple[int, float, Path]], wanted: str) -> tuple[NDArray[np.float64], list[Path]]:
-        """Stamps and files of an index, of its lines with both in the order of time; says which are left out."""
-        stamps = np.array([stamp for _, stamp, _ in rows])
-        good = self.in_order(stamps, "stamps", np.array([line for line, _, _ in rows], np.intp))
-        self.say(len(good), wanted)
-        return stamps[good], [rows[k][2] for k in good]
 
     def say(self, left: int, wanted: str) -> None:
         """Warn of the rows left out.

@@ -175,8 +175,8 @@ def _choose(root: Path, asked: Asked) -> SourcedSequence:
         (name,) = contents
     name = drive_name(name) if drive_name(name) in contents else name
     if name not in contents:
-        kitti = find_odometry_root(root)
-        under = root if kitti is None else kitti.sequences
+        odometry = find_odometry_root(root)
+        under = root if odometry is None else odometry.sequences
         raise SequenceError(
             f"no sequence {name} in {root}: found {found} under {under}; choose one of them with --sequence"
         )
@@ -187,11 +187,11 @@ def _unknown(root: Path) -> str:
     if root.is_file():
         known = ", ".join(suffix[1:] for suffix in VIDEO_SUFFIXES)
         return f"{root} is no video ({known}) and no bag (bag, db3, mcap): give one, or the folder of a data set"
-    kitti = find_odometry_root(root)
-    if kitti is not None:
+    odometry = find_odometry_root(root)
+    if odometry is not None:
         return (
-            f"no sequence with images under {kitti.sequences}: looked for png or jpg in */image_2, image_3, "
-            f"image_0, image_1; found {_listed(kitti.sequences)}; unpack the images there"
+            f"no sequence with images under {odometry.sequences}: looked for png or jpg in */image_2, image_3, "
+            f"image_0, image_1; found {_listed(odometry.sequences)}; unpack the images there"
         )
     looked = ", ".join(f"{loader.layout} ({loader.kind})" for loader in _loaders())
     return f"{root} is no data set: looked for {looked}; found {_listed(root)}; check the path"

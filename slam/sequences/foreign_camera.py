@@ -143,7 +143,7 @@ def _colmap(text: str) -> Keys:
 
 _PROGRAMS: dict[str, tuple[str, Callable[[Keys], Keys]]] = {
     "cam0": ("Kalibr", _kalibr),
-    "resolution": ("EuRoC", _euroc),
+    "T_BS": ("EuRoC", _euroc),
     "camera_matrix": ("ROS", _camera_info),
     "Camera.fx": ("ORB-SLAM", _orb_slam),
     "Camera1.fx": ("ORB-SLAM", _orb_slam),

@@ -111,7 +111,10 @@ def _index(table: Path, folder: Path, wanted: str, in_nanoseconds: bool = False)
             rows.append((number, stamp, folder / words[1]))
         else:
             bad.add(number, f"{line!r} is not {wanted}")
-    return bad.ordered(rows, f"rows of {wanted}")
+    stamps = np.array([stamp for _, stamp, _ in rows])
+    order = bad.in_order(stamps, "stamps", np.array([number for number, _, _ in rows], np.intp))
+    bad.say(len(order), f"rows of {wanted}")
+    return stamps[order], [rows[k][2] for k in order]
 
 
 def _depth_maps(paths: list[Path], per_metre: float, unknown: int = 0) -> DepthMaps | None:

@@ -354,27 +354,27 @@ def _points(clouds: StampedMessages, index: int, where: str) -> FloatArray:
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     """The cameras of a bag by topic; those of a folder of bags by bag, and by topic where a bag has several."""
-    if is_bag(path):
-        topics = camera_topics(path)
-        if not topics:
-            with closing(Bag(path)) as bag:
-                held = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.types.items())) or "nothing"
-            raise SequenceError(f"bag {path} has no topic with images of a camera: it holds {held}")
-        return {topic: _opener(path, topic, len(topics) > 1, asked) for topic in topics}
-    found = {}
-    for file in sorted(filter(is_bag, path.iterdir())) if path.is_dir() else ():
-        topics = camera_topics(file)
-        for topic in topics:
-            found[f"{file.stem}{topic}" if len(topics) > 1 else file.stem] = _opener(
-                file, topic, len(topics) > 1, asked
-            )
-    return found
+    if not is_bag(path):
+        bags = sorted(filter(is_bag, path.iterdir())) if path.is_dir() else []
+        found = {bag: _cameras(bag, asked) for bag in bags}
+        return {
+            f"{bag.stem}{topic}" if len(cameras) > 1 else bag.stem: opener
+            for bag, cameras in found.items()
+            for topic, opener in cameras.items()
+        }
+    cameras = _cameras(path, asked)
+    if not cameras:
+        with closing(Bag(path)) as bag:
+            held = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.types.items())) or "nothing"
+        raise SequenceError(f"bag {path} has no topic with images of a camera: it holds {held}")
+    return cameras
 
 
-def _opener(path: Path, topic: str, is_one_of_several: bool, asked: Asked) -> Opener:
-    stem = path.absolute().stem
-    name = stem + topic.replace("/", "_") if is_one_of_several else stem
-    return partial(open_topic, path, topic, name, asked.camera)
+def _cameras(path: Path, asked: Asked) -> dict[str, Opener]:
+    """The cameras of a bag by topic."""
+    topics, stem = camera_topics(path), path.absolute().stem
+    names = [stem + topic.replace("/", "_") if len(topics) > 1 else stem for topic in topics]
+    return {topic: partial(open_topic, path, topic, name, asked.camera) for topic, name in zip(topics, names)}
 
 
 LOADER = Loader("ROS bag", "a .bag, .db3 or .mcap", _find)

@@ -1,5 +1,7 @@
 """What people do to trajectories by mistake is named, and nothing is said of trajectories that are only noisy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -50,6 +52,17 @@ def test_another_clock(late_s: float) -> None:
     truth = drive(noise_m=0.0)
     (line,) = said(changed(truth, drive().T_world_camera, late_s), truth)
     assert f"{-late_s:+.2f} s" in line and "times better (0.0" in line
+
+
+def test_a_clock_that_runs_faster_and_frame_numbers_that_are_late() -> None:
+    truth = drive(noise_m=0.0)
+    (line,) = said(Trajectory(truth.stamps * 1.2, drive().T_world_camera), truth)
+    assert "run faster" in line
+    late = drive().T_world_camera[np.maximum(np.arange(300) - 5, 0)]
+    (line,) = said(
+        Trajectory(np.arange(300.0), late, timed=False), replace(truth, stamps=np.arange(300.0), timed=False)
+    )
+    assert "frame numbers by -5" in line
 
 
 @pytest.mark.parametrize(

@@ -195,3 +195,16 @@ def test_stamps_match_one_to_one_within_half_a_period() -> None:
     np.testing.assert_array_equal(estimate.stamps, stamps)
     np.testing.assert_allclose(matched.T_world_camera, reference.at(stamps).T_world_camera)
     assert matching_tolerance_s(estimate, reference) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("separator", [",", ";", ", ", "\t"])
+@pytest.mark.parametrize(("unit", "form"), [(1, "{:.6f}"), (10**3, "{:.0f}"), (10**6, "{:.0f}"), (10**9, "{:.0f}")])
+def test_tables_of_others(tmp_path: Path, separator: str, unit: int, form: str) -> None:
+    """Another separator, and stamps since 1970 in another unit, rows in no order."""
+    stamps = [1403715273.5, 1403715273.25, 1403715274.0, 1403715273.0]
+    w_last = unit != 10**9 or separator == "\t"  # separated nanoseconds are EuRoC's, with w x y z
+    rows = [[form.format(t * unit), f"{t - stamps[0]}", "0", "0", *("0001" if w_last else "1000")] for t in stamps]
+    (tmp_path / "t").write_text("t x y z\n" + "\n".join(separator.join(row) for row in rows))
+    found = read_trajectory(tmp_path / "t")
+    np.testing.assert_allclose(found.stamps, sorted(stamps), atol=1e-3)
+    np.testing.assert_allclose(found.positions[:, 0], np.array(sorted(stamps)) - stamps[0], atol=1e-6)

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence
@@ -56,13 +57,6 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(
         open_sequence(tmp_path, frames="1:4").frame(1)
 
 
-def test_a_gap_under_a_lens(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path, ["0.png", "1.png", "3.png", "4.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n")
-    with pytest.raises(MissingFrameError):
-        open_sequence(tmp_path).frame(2)
-
-
 @pytest.mark.parametrize("fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"])
 def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int) -> None:
     images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
@@ -89,17 +83,6 @@ def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: st
     assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx(np.diff(microseconds) / 1e6, abs=1e-6)
 
 
-def test_unlikely_stamps_and_pauses_are_warned_of(
-    tmp_path: Path, images, camera_yaml: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    images(tmp_path, [f"{k}.png" for k in range(4)])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "camera_height_m: 100\n")
-    (tmp_path / "times.txt").write_text("0\n100\n200\n9000\n")
-    open_sequence(tmp_path)
-    assert "its frames are 100 s apart" in caplog.text and "pause for 8800 s before frame 3" in caplog.text
-    assert "camera_height_m is 100" in caplog.text
-
-
 def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path, ["0.png", "1.png", "2.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
@@ -107,3 +90,43 @@ def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images,
     with pytest.raises(SequenceError, match=r"1\.png cannot be decoded") as caught:
         open_sequence(tmp_path).frame(1)
     assert not isinstance(caught.value, MissingFrameError)
+
+
+@pytest.mark.parametrize(
+    ("name", "rows"),
+    [
+        ("times.txt", "0 10.0\n1 10.1\n2 10.3\n"),
+        (
+            "timestamps.csv",
+            "name,time\n0.png,1403715273000000000\n1.png,1403715273100000000\n2.png,1403715273300000000\n",
+        ),
+        ("timestamps.txt", "1403715273000\n1403715273100\n1403715273300\n"),
+    ],
+)
+def test_tables_of_times(tmp_path: Path, images, camera_yaml: str, name: str, rows: str) -> None:
+    images(tmp_path, ["0.png", "1.png", "2.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    (tmp_path / name).write_text(rows)
+    assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx([0.1, 0.2], abs=1e-6)
+
+
+def test_a_table_of_times_cut_to_match_as_advised(tmp_path: Path, images, camera_yaml: str) -> None:
+    images(tmp_path, ["0.png", "1.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    times = ["0.0", "0.1", "0.2", "0.3"]
+    (tmp_path / "times.txt").write_text("\n".join(times))
+    with pytest.raises(SequenceError, match="cut the file to match"):
+        open_sequence(tmp_path)
+    (tmp_path / "times.txt").write_text("\n".join(times[:2]))
+    assert len(open_sequence(tmp_path)) == 2
+
+
+def test_a_camera_of_another_size_scaled_as_advised(tmp_path: Path, images, camera_yaml: str) -> None:
+    images(tmp_path, ["0.png", "1.png"])
+    path = tmp_path / "camera.yaml"
+    keys = yaml.safe_load(camera_yaml)
+    path.write_text(yaml.safe_dump({**keys, "width": 2 * keys["width"], "height": 2 * keys["height"]}))
+    with pytest.raises(SequenceError, match=r"scale the file to \{(.*)\}") as caught:
+        open_sequence(tmp_path)
+    path.write_text(yaml.safe_dump(keys | yaml.safe_load("{" + str(caught.value).rpartition("{")[2])))
+    assert open_sequence(tmp_path).intrinsics.fx == pytest.approx(keys["fx"] / 2)

@@ -56,3 +56,18 @@ def test_numbered_folders(trip: Path, images) -> None:
         images(trip / name, [f"{k}.png" for k in range(5)])
     sequence = open_sequence(trip)
     assert len(sequence) == 10 and (np.diff(sequence.stamps) > 0).all()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("GOPR0042", "GP010042", "GP020042"),
+        ("2024_0101_120000_0001F", "2024_0101_120002_0002F", "2024_0101_120004_0003F"),
+        ("NO20240101-120000-000001F", "NO20240101-120002-000002F", "NO20240101-120004-000003F"),
+        ("walk_part1", "walk_part2", "walk_part3"),
+    ],
+)
+def test_namings_of_pieces(trip: Path, names: tuple[str, ...]) -> None:
+    for k, name in enumerate(names):
+        write_clip(trip / f"{name}.avi", 20 * k)
+    np.testing.assert_allclose(open_sequence(trip).stamps, 0.1 * np.arange(60), atol=1e-6)

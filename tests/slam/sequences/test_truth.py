@@ -7,10 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slam.commands.doctor import examine
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 
 FRAMES = 8
@@ -76,3 +78,40 @@ def test_poses_beside_a_folder_are_named_and_not_used(recording: Path) -> None:
     assert open_sequence(recording).reference is None
     line = examine(recording)[-1]
     assert f"no true poses (--truth {beside} gives some)" in line
+
+
+def tum_rows() -> list[list[str]]:
+    """Words of a file of all frames at 10 a second, the camera's rate."""
+    poses = true_poses()
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    return [[f"{0.1 * k:.6f}", *map(repr, map(float, [*poses[k, :3, 3], *quaternions[k]]))] for k in range(FRAMES)]
+
+
+@pytest.mark.parametrize("wrong", ["nan", "cut off", "swapped", "reversed", "semicolons"])
+def test_a_table_that_is_slightly_wrong_costs_no_reference(recording: Path, truth: Path, wrong: str) -> None:
+    rows = tum_rows()
+    match wrong:
+        case "nan":
+            rows[4][1:] = ["nan"] * 7
+        case "cut off":
+            rows[-1] = rows[-1][:3]
+        case "swapped":
+            rows[3:5] = rows[4:2:-1]
+        case "reversed":
+            rows.reverse()
+    truth.write_text("\n".join((";" if wrong == "semicolons" else " ").join(row) for row in rows))
+    found = reference(recording, truth)
+    assert found is not None
+    np.testing.assert_allclose(found, true_poses(), atol=0.03)
+
+
+def test_stamps_in_another_unit_are_named_and_divided_they_fit(recording: Path, truth: Path) -> None:
+    rows = tum_rows()
+    truth.write_text("\n".join(" ".join([f"{1e6 * float(t):.1f}", *others]) for t, *others in rows))
+    with pytest.raises(SequenceError, match=r"look like microseconds: divide them by 1e\+06") as caught:
+        reference(recording, truth)
+    by = float(str(caught.value).rpartition(" ")[2])
+    table = np.loadtxt(truth)
+    table[:, 0] /= by
+    np.savetxt(truth, table)
+    assert reference(recording, truth) is not None

@@ -1,4 +1,3 @@
-import logging
 from pathlib import Path
 
 import cv2
@@ -49,13 +48,6 @@ def test_truth_is_interpolated(folder: Path) -> None:
     assert reference[1, 0, 2] == pytest.approx(np.sin(0.015), abs=1e-6)
 
 
-def test_uncovered_images_mean_no_reference(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write_truth(folder, np.arange(101.0, 102.0, 0.02))
-    with caplog.at_level(logging.WARNING):
-        assert open_sequence(folder, None, None, None).reference is None
-    assert "no pose of image 0" in caplog.text
-
-
 @pytest.mark.parametrize(
     "text, message",
     [
@@ -79,12 +71,6 @@ def test_bad_rows_are_left_out(folder: Path, caplog: pytest.LogCaptureFixture) -
     again = open_sequence(folder)
     np.testing.assert_array_equal(again.stamps, known.stamps)
     assert len(again) == len(known) and "2 of " in caplog.text
-
-
-def test_needs_a_camera_file(folder: Path) -> None:
-    (folder / "camera.yaml").unlink()
-    with pytest.raises(SequenceError, match=r"no camera\.yaml for "):
-        open_sequence(folder, None, None, None)
 
 
 @pytest.mark.parametrize("rows", [("100.035 near.png", "100.30 far.png"), ("100.30 far.png", "100.035 near.png")])

@@ -77,11 +77,6 @@ def test_no_black_border_and_none_to_spare(name: str) -> None:
     assert slack < 0.02 * WIDTH
 
 
-def test_no_distortion_changes_little() -> None:
-    undistortion = Undistortion(lens("none"))
-    assert 1.0 <= undistortion.intrinsics.fx / 180 < 1.021
-
-
 def test_folding_lens_is_refused_or_cropped() -> None:
     """A radius that runs backwards must not come into the image."""
     camera = lens("barrel").model_copy(update={"distortion": (-0.9, 0.0, 0.0, 0.0)})
@@ -105,13 +100,6 @@ class Blank:
 
     def read(self, index: int) -> np.ndarray:
         return np.zeros((self.height, self.width, 3), np.uint8)
-
-
-def test_pinhole_images_pass_untouched() -> None:
-    camera = CameraFile(width=40, height=24, fx=30, fy=30, cx=19.5, cy=11.5, fps=5)
-    blank = Blank(40, 24)
-    images, intrinsics = calibrated(blank, camera, "here")
-    assert images is blank and intrinsics == Intrinsics.of(camera.pinhole)
 
 
 def test_distorted_images_are_read_flat() -> None:

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -258,6 +259,37 @@ def test_stamped_poses_are_the_truth_where_their_topic_says_so(
         assert reference is None and "/pose is not named as truth" in caplog.text
     else:
         assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
+
+
+def test_poses_in_a_frame_that_says_truth(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    for k in range(-1, FRAMES + 1):
+        stamp = FIRST_NS + k * STEP_NS
+        each = bag.stamped_transform(stamp, "vicon/world", "camera", bag.transform((k, 5, 0)))
+        bag.write("/pose", stamp, each)
+    reference = open_sequence(bag.close()).reference
+    assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
+
+
+def test_a_calibration_without_a_size_is_of_the_images(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/cam0/camera_info", SimpleNamespace(**(vars(CAMERA) | {"width": 0, "height": 0})), "", ())
+    bag.image("/cam0/image_raw", FIRST_NS, picture(0), "mono8")
+    assert open_sequence(bag.close()).intrinsics == CAMERA
+
+
+def test_compressed_images_of_16_bits_share_a_stretch(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/c/camera_info", CAMERA, "", ())
+    for k in range(2):
+        values = (7000 + 4 * (k + 1) * picture(0).astype(np.uint16)).astype(np.uint16)
+        data, stamp = cv2.imencode(".png", values)[1].ravel(), FIRST_NS + k * STEP_NS
+        fields = {"header": bag.header(stamp, "c"), "format": "mono16; png", "data": data}
+        bag.write("/c/image/compressed", stamp, bag.make("sensor_msgs/msg/CompressedImage", **fields))
+    sequence = open_sequence(bag.close())
+    dark, bright = (float(sequence.frame(k).image.mean()) for k in range(2))
+    assert bright == pytest.approx(2 * dark, rel=0.05)
 
 
 def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str) -> None:

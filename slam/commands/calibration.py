@@ -230,35 +230,27 @@ def _calibration(
     return Calibration(model, *size, np.asarray(K), distortion, views, residuals, T_camera_board, sigma)
 
 
-def _require_determined(found: Calibration) -> None:
+def _require_determined(fit: Calibration) -> None:
     """Refuse a camera that the views do not determine.
 
     Raises:
         CalibrationError: with what to do.
     """
     advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
-    steepest = float(found.tilts_deg.max())
-    if steepest < _LEAST_TILT_DEG:
-        raise CalibrationError(
-            f"all {len(found.views)} views are frontal (tilts under {steepest:.0f} degrees): they do not determine the "
-            f"focal length; {advice}"
-        )
-    limit = _MOST_ERROR_PX * max(found.width / 640, 1.0)
-    if found.error_px > limit:
-        raise CalibrationError(
-            f"the reprojection error is {found.error_px:.2f} pixels, {limit:.1f} at most: is the board flat, --board "
-            f"right, and --model {found.model} that of the lens?"
-        )
-    if not found.focal_sigma <= _MOST_FOCAL_SIGMA:
-        raise CalibrationError(
-            f"the views leave the focal length uncertain by {100 * found.focal_sigma:.1f} %, at most "
-            f"{100 * _MOST_FOCAL_SIGMA:.1f} %: {advice}"
-        )
-    if found.covered < _LEAST_COVERED:
-        raise CalibrationError(
-            f"the board was seen in {100 * found.covered:.0f} % of the image alone, {100 * _LEAST_COVERED:.0f} % at "
-            f"least: the lens is not determined elsewhere; {advice}"
-        )
+    steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
+    faults = {
+        f"all {len(fit.views)} views are frontal (tilts under {steepest:.0f} degrees): they do not determine the focal "
+        f"length; {advice}": steepest < _LEAST_TILT_DEG,
+        f"the reprojection error is {fit.error_px:.2f} pixels, {most_error:.1f} at most: is the board flat, --board "
+        f"right, and --model {fit.model} that of the lens?": fit.error_px > most_error,
+        f"the views leave the focal length uncertain by {100 * fit.focal_sigma:.1f} %, at most "
+        f"{100 * _MOST_FOCAL_SIGMA:.1f} %: {advice}": not fit.focal_sigma <= _MOST_FOCAL_SIGMA,
+        f"the board was seen in {100 * fit.covered:.0f} % of the image alone, {100 * _LEAST_COVERED:.0f} % at least: "
+        f"the lens is not determined elsewhere; {advice}": fit.covered < _LEAST_COVERED,
+    }
+    for words, is_fault in faults.items():
+        if is_fault:
+            raise CalibrationError(words)
 
 
 def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: ImageSource) -> None:

@@ -28,9 +28,8 @@ from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking, height_of
 from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
-from slam.runtime.memory import return_freed_memory
 from slam.runtime.storage.spill import SpillFile
-from slam.runtime.timing import Stopwatch
+from slam.runtime.timing import Stopwatch, return_freed_memory
 
 logger = logging.getLogger(__name__)
 

@@ -106,13 +106,10 @@ class Record(BaseModel):
             raise
         except PermissionError as error:
             raise RunError(f"{path} cannot be read: {error.strerror}: check its permissions") from error
-        except ValidationError as error:
-            raise RunError(f"{path} is damaged: {first_problem(error)}; run the sequence again") from error
-        except RecursionError as error:
-            raise RunError(f"{path} is damaged: nested without end; run the sequence again") from error
-        except (OSError, ValueError) as error:
-            reason = " ".join(str(getattr(error, "strerror", None) or error).split())
-            raise RunError(f"{path} is damaged: {reason}; run the sequence again") from error
+        except (OSError, ValueError, RecursionError) as error:
+            reason = first_problem(error) if isinstance(error, ValidationError) else getattr(error, "strerror", None)
+            text = " ".join(str(reason or error).split())
+            raise RunError(f"{path} is damaged: {text}; run the sequence again") from error
 
     def __getitem__(self, key: str) -> Any:
         """The value of a key as JSON has it, so that a record reads like the file."""

@@ -10,8 +10,7 @@ import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
-from slam.frontend.keyframes.gaps import join_gap_ends
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, join_gap_ends
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,

@@ -18,7 +18,7 @@ from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPos
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState, ImageGate, Verdict
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start

@@ -272,7 +272,7 @@ class SlamPipeline:
             views, is_metric = odometry.views(), odometry.scale.is_metric
             return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
         closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
-        if closure.loops:
+        if closure.loops.accepted:
             drive = self._completed(observed, closure)
             odometry = self._odometry(drive, odometry.scale, odometry.lidar_steps, odometry.agreements)
         return odometry, closure.closures(odometry.scale)

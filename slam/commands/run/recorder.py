@@ -14,7 +14,7 @@ from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image
-from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
+from slam.loops.verification import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.depth_prior import HUBER
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
-from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
-from slam.geometry.projection import pixel_jacobian
+from slam.geometry.resection import LEAST_DEPTH as _LEAST_DEPTH
+from slam.geometry.resection import pixel_jacobian
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, compose, make
 

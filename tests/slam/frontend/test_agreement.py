@@ -18,10 +18,10 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
 from slam.frontend.segments import Segment
 from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.moving_regions import DynamicMask
 from slam.frontend.visual.odometry import OdometryState
 from slam.geometry import se3
 

@@ -3,8 +3,7 @@ from itertools import pairwise
 import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, RelativePose
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
-from slam.frontend.keyframes.gaps import join_gap_ends
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, join_gap_ends
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 from slam.graph.pose_graph import PoseGraph
 

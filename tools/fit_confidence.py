@@ -100,7 +100,7 @@ def main(words: Sequence[str] | None = None) -> None:
     stated = np.array([share_right(each.sigmas, constants[each.drive]) for each in known_cameras])
     right = np.mean([each.error <= RIGHT for each in known_cameras])
     head = ("confidence by the other drives", "runs", "mean", "share right")
-    print(Table(head, rows(known_cameras, stated)).markdown())
+    print(Table(head, list(rows(known_cameras, stated))).markdown())
     in_use = np.array([share_right(each.sigmas, CONFIDENCE) for each in known_cameras])
     scores = brier(known_cameras, stated), brier(known_cameras, in_use), right * (1 - right)
     print("Brier score {:.3f} by the other drives, {:.3f} as in use, {:.3f} of a constant".format(*scores))

@@ -113,8 +113,7 @@ def live(
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.request import LiveRequest
-    from slam.commands.live.run import run_live, write_line
+    from slam.commands.live.run import LiveRequest, run_live, write_line
 
     request = LiveRequest(
         dataset=dataset,

@@ -21,15 +21,13 @@ from erfsfm.common.table import DASH, Table
 from slam.config.sections import LoopsConfig, load_stored
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.frontend.keyframes.camera_pose import resect
-from slam.geometry.resection import consensus
-from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_matrix
+from slam.geometry.resection import consensus, resect
+from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.structure import PlaceStructure
-from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
-from slam.loops.verification import matches
+from slam.loops.verification import OF_KEYFRAMES, LoopThresholds, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import CONFIG, PLACES
@@ -211,7 +209,7 @@ class Localiser:
     def _found(self, name: str, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
         starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
-        starts.sort(key=lambda start: len(start[2]), reverse=True)
+        starts.sort(key=lambda start: len(start[1]), reverse=True)
         found = [self._refined(name, start, rows, view, learned) for start in starts[:_STARTS]]
         nowhere = Localisation(name, reason="no place has corners that fit one pose")
         return max(found, key=lambda each: each.inliers, default=nowhere)
@@ -219,19 +217,19 @@ class Localiser:
     def _refined(
         self,
         name: str,
-        start: tuple[FloatArray, FloatArray, NDArray[np.intp]],
+        start: tuple[FloatArray, NDArray[np.intp]],
         rows: list[int],
         view: View,
         learned: bool,
     ) -> Localisation:
         """The pose by all corners of the map around a first one; or why it is none."""
-        T_camera_world = make(rotation_matrix(start[0]), start[1])
+        T_camera_world, _ = start
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
             if len(points) < self._thresholds.min_inliers:
                 return Localisation(name, reason=f"only {len(points)} corners agree")
-            pose = resect([T_camera_world], points, pixels, self._intrinsics)
+            pose = resect([T_camera_world], points, pixels, self._intrinsics.K)
             T_camera_world = pose.T_camera_world
         inliers = pose.residual_px < self._thresholds.reprojection_px
         count = int(inliers.sum())
@@ -244,7 +242,7 @@ class Localiser:
             return Localisation(name, reason=reason)
         return Localisation(name, invert(T_camera_world), inliers=count)
 
-    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, FloatArray, NDArray[np.intp]] | None:
+    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]] | None:
         """The pose by one place, as `consensus` gives it."""
         corners, seen = matches(self._places.views[row], view, self._thresholds)
         points = self._structure.points(row, learned)[corners]

@@ -20,7 +20,7 @@ from slam.frames import Image, Sequence
 from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places
 from slam.loops.structure import PlaceStructure
-from slam.loops.thresholds import OF_KEYFRAMES
+from slam.loops.verification import OF_KEYFRAMES
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import PLACES

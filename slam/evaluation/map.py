@@ -7,11 +7,12 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
@@ -32,6 +33,7 @@ from slam.evaluation.surface import (
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
 from slam.runtime.attempt import Failed
+from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part
 
 NEAR_CAMERA_M = 20.0
@@ -40,6 +42,9 @@ F_SCORES_M = {"0.2": 0.2, "0.5": 0.5}
 BINS_M = ((0.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
 OUTLIER_M = 1.0
 
+_WALL_NEAR_M, _WALL_FAR_M = 0.3, 2.0  # of the second surface in front of the first
+_PARALLEL = 0.7  # least cosine of the two normals
+_MOST_RAYS = 20_000  # of a piece
 _LEVER_M = 10.0  # distance from the camera at which an alignment counts rotations
 _LEAST_IN_BIN = 20
 _LEAF_POINTS = 32  # of the tree of true surface: less memory than with 16
@@ -144,16 +149,10 @@ class MapDistances:
         return self._of(self.in_field, np.ones(len(self.to_map), dtype=bool))
 
 
-@dataclass(frozen=True)
-class MapComparison:
-    """Distances by name of the placed map, and the length of road that was looked at."""
-
-    distances: Mapping[str, MapDistances]
-    length_m: float
-
-
-def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, FloatArray]) -> MapComparison:
-    """Distances between maps and the true surface, one stretch of road at a time.
+def compare(
+    truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, FloatArray]
+) -> tuple[dict[str, MapDistances], float]:
+    """Distances between maps and the true surface by name, and the length of road looked at, stretch by stretch.
 
     Args:
         truth: the surface.
@@ -175,7 +174,7 @@ def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, 
             in_field, to_map = truth.in_field(points[own], near), _to_map(on_surface, points)
             found[name].append(MapDistances(distances, away[own], in_field, to_map, surface_range))
         del to_surface  # it holds the surface
-    return MapComparison({name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts))
+    return {name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts)
 
 
 _Kind = TypeVar("_Kind", bound=SurfaceMetrics)
@@ -271,3 +270,36 @@ def _together(parts: list[MapDistances]) -> MapDistances:
         return np.concatenate([getattr(each, name) for each in parts])
 
     return MapDistances(*(all_of(each.name) for each in fields(MapDistances)))
+
+
+def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) -> float:
+    """Share of the area with a parallel surface 0.3 to 2 m before it; NaN without any area.
+
+    Args:
+        pieces: vertices ``(V, 3)`` and triangles ``(T, 3)``, whose normals look to where the camera was.
+    """
+    found = total = 0.0
+    for vertices, triangles in pieces:
+        corners = vertices[triangles]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        doubled_area = np.linalg.norm(normal, axis=1)
+        chosen = np.flatnonzero(doubled_area > 0)
+        chosen = chosen[:: -(-len(chosen) // _MOST_RAYS) or 1]
+        direction = normal[chosen] / doubled_area[chosen, None]
+        is_double = _has_parallel_before(vertices, triangles, corners[chosen].mean(axis=1), direction)
+        weight = doubled_area.sum() / max(doubled_area[chosen].sum(), np.finfo(float).tiny)
+        found += weight * float(doubled_area[chosen][is_double].sum())
+        total += float(doubled_area.sum())
+    return found / total if total > 0 else float("nan")
+
+
+def _has_parallel_before(
+    vertices: FloatArray, triangles: NDArray[np.int64], points: FloatArray, direction: FloatArray
+) -> NDArray[np.bool_]:
+    o3d = import_open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
+    rays = np.concatenate([points + _WALL_NEAR_M * direction, direction], axis=1).astype(np.float32)
+    answer = scene.cast_rays(o3d.core.Tensor(rays))
+    cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)
+    return np.asarray((answer["t_hit"].numpy() <= _WALL_FAR_M - _WALL_NEAR_M) & (cosine > _PARALLEL))

@@ -10,8 +10,7 @@ import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
-from slam.frontend.keyframes.gaps import join_gap_ends
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, join_gap_ends
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
@@ -28,19 +27,20 @@ from slam.geometry.se3 import FloatArray, compose, rigid
 logger = logging.getLogger(__name__)
 
 
-def make_factors(drive: Drive, scale: Scale) -> list[RelativePose]:
+def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[RelativePose]:
     """All relative poses with their noise, in the unit of the scale.
 
     Args:
         drive: completed.
         scale: of each frame, and the lengths of steps.
+        level: of the line in the log that says what the pose network measured.
     """
     maps = drive.map_poses
     geometric = _geometric(drive.steps, scale)
     by_keyframes = scaled_poses(maps.poses, maps, scale)
     steps = network_steps(drive.trusted)
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
-    logger.info("pose network: %s", calibration.over(scale.per_frame))
+    logger.log(level, "pose network: %s", calibration.over(scale.per_frame))
     networks = network_factors(steps, calibration)
     if not calibration.is_measured:  # lengths in the wrong unit have no say beside measured ones
         by_geometry = {pose.ends for pose in geometric}
@@ -51,18 +51,6 @@ def make_factors(drive: Drive, scale: Scale) -> list[RelativePose]:
     )
     interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
     return [*by_network, *interpolated, *by_image, *by_keyframes]
-
-
-def scaled_steps(drive: Drive, scale: Scale) -> list[RelativePose]:
-    """Steps of the network, interpolated and of image geometry in the unit of the scale, the last without noise."""
-    interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
-    by_image = []
-    for ends, motion in drive.steps.motions.items():
-        length, pose = scale.lengths.get(ends) if motion.is_triangulated else None, motion.relative_pose
-        by_image.append(scale.scaled(pose) if length is None else pose.scaled(length.value / motion.length_unscaled))
-    steps = network_steps(drive.trusted)
-    by_network = network_factors(steps, calibrate_network(steps, by_image, scale.per_frame))
-    return [*by_network, *interpolated, *by_image]
 
 
 def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:

@@ -14,15 +14,14 @@ from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.keyframes.descriptors import describe
-from slam.frontend.keyframes.flow import new_corners
-from slam.frontend.keyframes.local_map import LocalMap
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.tracking import new_corners
 from slam.geometry.se3 import FloatArray, invert
+from slam.loops.descriptors import describe
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
 

@@ -16,7 +16,7 @@ from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
 from slam.loops.structure import PlaceStructure
-from slam.loops.thresholds import OF_KEYFRAMES
+from slam.loops.verification import OF_KEYFRAMES
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.run import Recorder, SlamPipeline

@@ -18,7 +18,7 @@ from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPos
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState, ImageGate, Verdict
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
@@ -116,8 +116,8 @@ class Observer:
         self._keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
         )
-        self._road = RoadHomography(config.road, intrinsics)
-        self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
+        self._road = RoadHomography(intrinsics)
+        self._plane = GroundPlaneFitter(intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
         self._snippet_frames: tuple[Frame, ...] = ()
         self._recent: tuple[FrameInWork, ...] = ()

@@ -158,7 +158,7 @@ class SlamPipeline:
             lidar = lidar_path(self.sequence, self._progress)
         lidar_steps, agreements = self._compared(drive, lidar, observed)
         with self._watch.stage("scale"):
-            scale = find_scale(self.mode, self.sequence.camera_height_m, drive, lidar_steps, self._config.lengths)
+            scale = find_scale(self.mode, self.sequence.camera_height_m, drive, lidar_steps)
         odometry = self._odometry(drive, scale, lidar_steps, agreements)
         recorder.trajectory("odometry", self._trajectory(odometry.T_world_camera))
         with self._watch.stage("loops"):
@@ -272,7 +272,7 @@ class SlamPipeline:
             views, is_metric = odometry.views(), odometry.scale.is_metric
             return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
         closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
-        if closure.loops:
+        if closure.loops.accepted:
             drive = self._completed(observed, closure)
             odometry = self._odometry(drive, odometry.scale, odometry.lidar_steps, odometry.agreements)
         return odometry, closure.closures(odometry.scale)
@@ -287,7 +287,7 @@ class SlamPipeline:
         self, odometry: Odometry, loops: LoopClosures, location: Location | MeasurementFailure | None
     ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | MeasurementFailure | None]:
         """The graph, its trajectory ``(N, 4, 4)``, the loops that agree with it, and where it lies on the earth."""
-        graph, positioning = PoseGraph(self._config.pose_graph), self._positioning
+        graph, positioning = PoseGraph(), self._positioning
         T_odometry = odometry.T_world_camera
         graph.add_relative(*odometry.factors, *(loop.measured for loop in loops.accepted))
         if positioning is not None and isinstance(location, Location):

@@ -17,22 +17,26 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence, runs
+from slam.frontend import gps
 from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
-from slam.geometry.se3 import umeyama
+from slam.geometry.se3 import FloatArray, umeyama
 from slam.pipeline.estimate import Estimate
+from slam.pipeline.positioning import Location
 from slam.results.folder import RunFolder
-from slam.results.gps import gps_metrics
 from slam.results.metrics import (
     AgreementMetrics,
     ConfidenceMetrics,
     CoverageMetrics,
     Event,
+    GpsErrors,
+    GpsMetrics,
     GraphMetrics,
     LearnedDepthError,
     LoopMetrics,
     Metrics,
+    Origin,
     Provenance,
     ScaleMetrics,
     SequenceMetrics,
@@ -71,7 +75,7 @@ def estimate_metrics(
             optimised=trajectory_metrics(result.optimised, result.reference),
             lidar=_lidar_metrics(result, sequence),
         ),
-        gps=gps_metrics(result, gps_in_graph),
+        gps=_gps(result, gps_in_graph),
         graph=_graph(result),
         loops=LoopMetrics.model_validate(result.loops.summary()),
         tracking=_tracking(result),
@@ -176,8 +180,8 @@ def _graph(result: Estimate) -> GraphMetrics:
         still = Failed("the estimate does not move: the truth cannot be scaled to it")
         return GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=still)
     covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
-    by_source = {source: CoverageMetrics.model_validate(shares) for source, shares in covered.by_source.items()}
-    overall = CoverageMetrics.model_validate(covered.overall)
+    by_source = {source: CoverageMetrics.of(**shares) for source, shares in covered.items()}
+    overall = by_source.pop("")
     return GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
 
 
@@ -200,3 +204,34 @@ def _depth_error(result: Estimate) -> list[LearnedDepthError] | Failed:
     if not curve:
         return Failed("no step triangulated corners with learned depth")
     return [LearnedDepthError(depth=unit * at, bias=b, sigma=s, corners=count) for at, b, s, count in curve]
+
+
+def _gps(result: Estimate, in_graph: bool) -> GpsMetrics | Failed:
+    """Distances of odometry and optimised trajectory from the fixes, and the place of the first camera."""
+    location = result.location
+    if not isinstance(location, Location):
+        return location or Failed("no GPS track was given")
+    T_enu_first = location.T_enu_world @ result.optimised.T_world_camera[0]
+    latitude, longitude, height = location.fixes.frame.places(T_enu_first[None, :3, 3])[0].tolist()
+    ahead = T_enu_first[:3, 2]
+    heading = float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0)
+    aligned = gps.align(location.fixes, result.odometry.T_world_camera, result.odometry.stamps)
+    return GpsMetrics.of(
+        fixes=len(location.fixes.stamps),
+        in_graph=in_graph,
+        origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
+        odometry=aligned
+        if isinstance(aligned, MeasurementFailure)
+        else _distances(location.fixes, aligned, result.odometry),
+        optimised=_distances(location.fixes, location.T_enu_world, result.optimised),
+    )
+
+
+def _distances(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> GpsErrors:
+    apart = gps.offsets(fixes, T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
+    level = np.linalg.norm(apart[:, :2], axis=1)
+    return GpsErrors(
+        horizontal_rmse_m=float(np.sqrt((level**2).mean())),
+        horizontal_median_m=float(np.median(level)),
+        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean())),
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from slam.results.metrics import Metrics
 from slam.results.output_folder import claim, stamped
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, trajectory_file
+from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, REPORT, trajectory_file
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import NOT_RECORDED
 
@@ -24,8 +25,14 @@ class RunFolder:
     """The files of one run, under the names of the contract (``docs/run-folder.md``)."""
 
     def __init__(self, path: str | Path) -> None:
-        """A folder that exists, such as ``results/latest``."""
+        """A folder that exists, such as ``results/latest``.
+
+        Raises:
+            RunError: it is not there.
+        """
         self.path = Path(path)
+        if not self.path.is_dir():
+            raise RunError(f"{path} is not there: give a folder that 'erfsfm-slam run' wrote")
 
     @classmethod
     def create(cls, output: Path | None, results: Path, sequence: str, lock: FolderLock | None = None) -> RunFolder:
@@ -58,11 +65,6 @@ class RunFolder:
         Raises:
             RunError: no run there.
         """
-        return cls.open_with_metrics(path)[0]
-
-    @classmethod
-    def open_with_metrics(cls, path: str | Path) -> tuple[RunFolder, Metrics]:
-        """As `open`, with its `metrics`, which are read once."""
         path = Path(path)
         if not (path / METRICS).is_file() and not (path / ESTIMATE).is_file():
             what = "no such folder" if not path.exists() else f"it holds no {METRICS}"
@@ -71,7 +73,7 @@ class RunFolder:
         metrics = folder.metrics()
         if metrics.failure:
             logger.warning("%s: %s: files that are there are whole", path, metrics.failure)
-        return folder, metrics
+        return folder
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file atomically."""
@@ -115,10 +117,17 @@ class RunFolder:
         return import_open3d().io.read_point_cloud(str(self.require(MAP_CLOUD)))
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        from slam.results.notebook import html
+        """What a notebook shows: errors, and the unit of lengths."""
+        from slam.results.tables import errors_table
 
-        return html(self)
+        metrics = self.metrics()
+        title = f"{metrics.sequence.name or self.path.name}: {metrics.sequence.frames or 0} frames"
+        errors = metrics.evaluated_errors()
+        notes = [note for note in (metrics.failure, *metrics.unit_notes()) if note]
+        if (self.path / REPORT).is_file():
+            notes.append(f"Report: {self.path / REPORT}")
+        table = errors_table(errors).html() if errors else ""
+        return f"<h4>{escape(title)}</h4>{table}" + "".join(f"<p>{escape(note)}</p>" for note in notes)
 
     def require(self, name: str) -> Path:
         """The path of a file of the run.

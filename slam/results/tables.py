@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from erfsfm.common.table import DASH, Table
 from slam.evaluation.trajectory import ALIGNMENTS, TrajectoryMetrics
-from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
+
+if TYPE_CHECKING:
+    from slam.results.folder import RunFolder
 
 UNITS = "ATE: RMSE, m; of snippets of five frames, each with its own scale, norm / 5. RE: rad. t_rel, r_rel: 7 dof."
 _LEAK = "LEAK: the weights were trained on the sequence; the numbers are no test."

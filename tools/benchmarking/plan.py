@@ -39,7 +39,6 @@ class Configuration:
     overrides: tuple[str, ...] = ()
 
 
-_UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
 _NEVER = 1e9  # a limit that no measurement reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
@@ -52,16 +51,10 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no dynamic mask": ("visual_odometry.dynamic_mask_sharpness=0",),
     "no second search with a wide window": ("visual_odometry.few_corners=0",),
     "no lengths from the road homography": ("road.enabled=false",),
-    "no ratios of neighbouring steps": (f"lengths.ratio_sigma={_UNINFORMATIVE}",),
-    "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
-    "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
-    "no short strip of road": ("road.near_heights=1e-3",),
     "no gap interpolation": ("gaps.enabled=false",),
     "no loops": ("loops.enabled=false",),
     "no consistency among loops": ("loops.min_support=0",),
-    "no robust kernel": ("pose_graph.kernel=none",),
     "no agreement of a loop in both directions": ("loops.agreement_deg=180", f"loops.agreement_ratio={_NEVER}"),
-    "no loop dropped": (f"pose_graph.max_loop_residual={_NEVER}",),
     "no fusion": ("mapping.enabled=false",),
 }
 ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _PARTS.items()))

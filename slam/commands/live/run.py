@@ -7,16 +7,16 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import Any, TextIO
+from typing import Any, Literal, TextIO
 
 import numpy as np
 
 from erfsfm.common.lock import FolderLock
 from erfsfm.common.signals import raising_on_termination
 from slam.commands.live.reader import EXPECTED, StreamedSequence, calibration_of
-from slam.commands.live.request import LiveRequest
 from slam.commands.live.source import open_source
 from slam.commands.live.view import Viewer
 from slam.commands.run.recorder import FolderRecorder
@@ -43,6 +43,24 @@ logger = logging.getLogger(__name__)
 
 Emit = Callable[[dict[str, Any]], None]
 _DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """All inputs of a live run, as ``erfsfm-slam live --help`` says; ``command`` is recorded in the metrics."""
+
+    dataset: str
+    camera: Path | None = None
+    every_frame: bool = False
+    output: Path | None = None
+    view: bool = False
+    wait: float = 10.0
+    weights: str = "default"
+    config: str | None = None
+    overrides: list[str] | None = None
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    command: str = "slam.commands.live.run.run_live"
 
 
 def run_live(request: LiveRequest, emit: Emit) -> RunFolder:

@@ -10,11 +10,11 @@ from dataclasses import asdict
 from erfsfm.common.errors import explained
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import SlamConfig, dump_yaml
-from slam.evaluation.double_walls import double_wall_share
+from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image
-from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
+from slam.loops.verification import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
@@ -22,7 +22,7 @@ from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors
-from slam.results.metrics import MapMetrics, Metrics, Provenance
+from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
 from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
@@ -119,7 +119,7 @@ class FolderRecorder(Recorder):
 
     def no_map(self, reason: str) -> None:
         """The reason is its metric."""
-        self._metrics = self._metrics.changed(map=MapMetrics.unknown(reason))
+        self._metrics = self._metrics.changed(map=MapMetrics.unknown(reason, *SIZES, *MAP_ERRORS))
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Image, Intrinsics, View
-from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.residuals import Residuals
+from slam.geometry.epipolar import UnitRelativePose
 from slam.geometry.se3 import invert
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import Loop, matches
+from slam.loops.verification import Loop, LoopThresholds, matches
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.page import Picture
 
@@ -99,7 +98,7 @@ def _joined(first: Image, second: Image, from_: NDArray[np.float32], to: NDArray
     starts = from_ * (_WIDTH_PX / first.shape[1])
     ends = to * (_WIDTH_PX / second.shape[1]) + ([0, left.shape[0]] if wide else [_WIDTH_PX, 0])
     for k, line in enumerate(np.rint(np.stack([starts, ends], axis=1)).astype(int).tolist()):
-        cv2.line(joined, *line, _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
+        cv2.line(joined, line[0], line[1], _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
         for place in line:
             cv2.circle(joined, place, 2, _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
     return joined

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.config.sections import PoseGraphConfig
 from slam.evaluation.coverage import coverage
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.network_factors import calibrate_network, chain_raw, network_factors, network_steps
@@ -165,7 +164,7 @@ def test_stated_noise_of_the_network_holds() -> None:
     for seed in range(3):
         steps = seen_by_network(T, seed=seed)
         factors = network_factors(steps, calibrate_network(steps, measured(T), DEPTH_UNIT))
-        inside.append(coverage(factors, T, 1.0).overall)
+        inside.append(coverage(factors, T, 1.0)[""])
     for level, least, most in (("50", 0.4, 0.65), ("90", 0.85, 0.97), ("95", 0.91, 0.99)):
         assert least < np.mean([each[level] for each in inside]) < most
 
@@ -176,7 +175,7 @@ def test_the_network_makes_no_drive_shorter() -> None:
     factors = network_factors(steps, calibrate_network(steps, geometric, DEPTH_UNIT))
 
     def length(*factors: RelativePose) -> float:
-        graph = PoseGraph(PoseGraphConfig())
+        graph = PoseGraph()
         graph.add_relative(*factors)
         return float(se3.path_distance(graph.optimise(T))[-1])
 

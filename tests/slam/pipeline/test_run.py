@@ -145,7 +145,7 @@ def test_an_error_in_loops_or_graph_costs_these(stage: str, monkeypatch: pytest.
     monkeypatch.setattr(f"slam.pipeline.run.{stage}", failing)
     result = pipeline.run(Keeping())
     assert kept == [("reference", 30), ("network", 30), ("odometry", 30)]
-    assert result.loops.not_sought is not None and "KeyError: 7 (test_batch.py:" in result.loops.not_sought
+    assert result.loops.not_sought is not None and "KeyError: 7 (test_run.py:" in result.loops.not_sought
     assert isinstance(result.graph, Failed) == (stage == "PoseGraph")
     assert ate(result.optimised, result.reference) < 1e-3
     monkeypatch.setenv(SHOW_TRACEBACK, "1")

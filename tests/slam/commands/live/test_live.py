@@ -25,8 +25,7 @@ import pytest
 
 from slam import run_slam
 from slam.commands.live.reader import Reader, StreamedSequence, calibration_of
-from slam.commands.live.request import LiveRequest
-from slam.commands.live.run import run_live
+from slam.commands.live.run import LiveRequest, run_live
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
@@ -102,11 +101,11 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
 
 @pytest.mark.parametrize(("mode", "unit"), [("auto", None), ("none", "the networks' own unit")])
 def test_without_a_road_there_are_no_metres_and_no_camera_heights(
-    street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None
+    street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("slam.frontend.scale.road_plane._ROAD_ROWS", (0.0, 0.001))  # at the horizon
     target, messages = filled(street, tmp_path)
-    at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
-    settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
+    settings = (*SETTINGS, "road.enabled=false", f"scale.mode={mode}")
     request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     recorded = folder.metrics().tree()["scale"]

@@ -18,7 +18,6 @@ import slam.results.estimate_metrics
 from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.commands.run import recorder
-from slam.config.sections import PoseGraphConfig
 from slam.graph.pose_graph import PoseGraph
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
@@ -232,7 +231,7 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
     class Result:
         optimised = run.trajectory("network")
         reference = run.trajectory("reference")
-        graph = PoseGraph(PoseGraphConfig())
+        graph = PoseGraph()
 
     assert Result.optimised is not None
     Result.optimised.T_world_camera[:] = np.eye(4)

@@ -2,10 +2,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam.config.sections import PoseGraphConfig
 from slam.frames import KEYFRAME_SOURCE, RelativePose
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
-from slam.frontend.keyframes.gaps import join_gap_ends
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, join_gap_ends
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 from slam.graph.pose_graph import PoseGraph
 
@@ -28,7 +26,7 @@ def test_a_long_gap_ends_where_the_map_says() -> None:
     measured = [relative(truth, after, after + 1, 0.01, "essential")]
     found = join_gap_ends(guesses, measured, by_map, dict.fromkeys(mapped, 0))
     assert [pose.ends for pose in found] == [pose.ends for pose in guesses]
-    graph = PoseGraph(PoseGraphConfig())
+    graph = PoseGraph()
     graph.add_relative(*found, *measured, *by_map)
     start = np.tile(np.eye(4), (count, 1, 1))
     for pose in [*found, *measured, *by_map]:

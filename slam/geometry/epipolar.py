@@ -1,6 +1,6 @@
 """Two-view geometry of calibrated points: motions by consensus, and triangulation.
 
-A motion is ``x_current ~ R_current_previous @ X_previous + direction``; ``frontend/visual/two_view.py`` refines it.
+A motion is ``x_current ~ R_current_previous @ X_previous + direction``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from typing import Self
 import cv2
 import numpy as np
 
-from slam.frames import Intrinsics
 from slam.geometry.resection import consensus, ransac_order
-from slam.geometry.se3 import FloatArray, invert, nearest_rotation, rotation_matrix
+from slam.geometry.se3 import FloatArray, invert, nearest_rotation
 
 _TRIMMINGS = 4
 _RESECTIONS = 200
@@ -106,24 +105,24 @@ def unit_pose_by_pnp(
     if known.sum() < _LEAST_POINTS:
         return None
     points = rays_previous[known] * depth_previous[known, None]
-    found = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
-    if found is None:
+    pose = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
+    if pose is None:
         return None
-    rotation, translation, _ = found
-    length = float(np.linalg.norm(translation))
-    return UnitRelativePose(rotation_matrix(rotation), translation / length) if length > 0 else None
+    T_current_previous, _ = pose
+    length = float(np.linalg.norm(T_current_previous[:3, 3]))
+    return UnitRelativePose(T_current_previous[:3, :3], T_current_previous[:3, 3] / length) if length > 0 else None
 
 
 def parallax_px(
     rays_previous: FloatArray,
     rays_current: FloatArray,
     R_current_previous: FloatArray,
-    intrinsics: Intrinsics,
+    focal: tuple[float, float],
 ) -> FloatArray:
     """Optical flow of each point in pixels ``(M,)`` without that of the rotation."""
     rotated = rays_previous @ R_current_previous.T
     rotated = rotated[:, :2] / np.where(rotated[:, 2:] > 1e-6, rotated[:, 2:], 1e-6)
-    difference = (rays_current[:, :2] - rotated) * [intrinsics.fx, intrinsics.fy]
+    difference = (rays_current[:, :2] - rotated) * focal
     return np.asarray(np.linalg.norm(difference, axis=1))
 
 

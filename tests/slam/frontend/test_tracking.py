@@ -8,9 +8,9 @@ import pytest
 
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
-from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.frontend.tracking import CornerTracker
 from slam.frontend.visual.predicted_flow import PredictedFlow
-from slam.frontend.visual.tracking import CornerTracker
+from slam.geometry.epipolar import UnitRelativePose
 
 CONFIG = VisualOdometryConfig(max_corners=300)
 SHIFT_PX = 4

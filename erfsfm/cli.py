@@ -138,8 +138,7 @@ def receptive_field(
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
     from erfsfm.receptive_field.figure import draw_fields
-    from erfsfm.receptive_field.measure import field_table, measure_fields
-    from erfsfm.receptive_field.street import street_snippet
+    from erfsfm.receptive_field.measure import field_table, measure_fields, street_snippet
 
     require_figure(output)
     if images is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shlex
 import sys
 from pathlib import Path
@@ -57,6 +58,7 @@ def train(
             return
         folder = run_training(experiment, output, resume, device, command, progress)
         typer.echo(f"weights in {folder}: use them with --weights {folder}")
+        typer.echo(_how_good(folder))
         if experiment.initial_weights is None or experiment.data.validation_share == 0:
             return
         try:
@@ -65,6 +67,26 @@ def train(
             logger.warning("depth before and after training was not compared: %s", error)
             return
     print_rows(rows, as_json=False)
+
+
+def _how_good(folder: Path) -> str:
+    """What the last validation measured, and the command that measures the weights on other data."""
+    from erfsfm.model_record import read_record
+
+    record = read_record(folder / "model.yaml")
+    units = {
+        "abs_rel": "AbsRel {:.3f}",
+        "snippet_ate": "snippet ATE {:.4f} m",
+        "photometric": "photometric error {:.4f}",
+    }
+    measured = [
+        text.format(record.metrics[key])
+        for key, text in units.items()
+        if math.isfinite(record.metrics.get(key, math.nan))
+    ]
+    kind, data = ("pose", "KITTI --sequence 09") if record.networks == "pose" else ("depth", "ROOT")
+    said = f"validation: {', '.join(measured)}" if measured else "they were not validated"
+    return f"{said}; errors on other data: erfsfm evaluate {kind} --weights {folder} --dataset {data}"
 
 
 def train_fusion(

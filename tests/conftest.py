@@ -23,6 +23,8 @@ os.environ.setdefault("MPLCONFIGDIR", str(Path(tempfile.gettempdir()) / f"erfsfm
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
+import erfsfm  # noqa: E402, F401  before any test module loads OpenCV, which then reads the largest image from it
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _separate_home(tmp_path_factory: pytest.TempPathFactory) -> None:

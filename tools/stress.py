@@ -23,6 +23,7 @@ from shared.command import one_line_errors, parser_of
 
 from erfsfm.common.table import Table
 from slam import run_slam
+from slam.formats.trajectory import Trajectory, write_kitti
 from slam.frames import Sequence as FrameSequence
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
@@ -30,7 +31,7 @@ from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.hazards import Hazard
-from slam.simulation.kitti_layout import write_image, write_lines, write_poses
+from slam.simulation.kitti_layout import write_image, write_lines
 from slam.simulation.options import SimulationOptions
 
 Image = NDArray[np.uint8]
@@ -144,7 +145,7 @@ def run(drive: Drive, camera: FrameSequence, weights: str, place: Path, output: 
         write_image(place / "images" / f"{k:06d}.png", image)
     write_lines(place / "camera.yaml", [f"{key}: {value}" for key, value in lines.items()])
     write_lines(place / "times.txt", [f"{stamp:.6f}" for stamp in drive.stamps])
-    write_poses(place / "truth.txt", drive.T_world_camera)
+    write_kitti(place / "truth.txt", Trajectory(np.arange(len(drive.stamps), dtype=float), drive.T_world_camera))
     return run_slam(place, weights=weights, truth=place / "truth.txt", output=output, overrides=OVERRIDES)
 
 
@@ -174,7 +175,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", help="A:B, of simulated worlds", default="840:846")
     parser.add_argument("--change", action="append", choices=list(CHANGES), help="default: every one; repeat")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--keep", type=Path, help="folder for the run folders, which fit_confidence.py reads")
+    parser.add_argument("--keep", type=Path, help="folder for the run folders")
     o = parser.parse_args(words)
     cameras: list[FrameSequence] = []
     if o.dataset is not None:

@@ -313,7 +313,7 @@ def simulate(
     varied: Annotated[
         bool,
         typer.Option(
-            "--varied", help="another camera than KITTI's, railings, people, cars that overtake; of rooms another lens"
+            "--varied", help="any camera, hills, hard light, kinds of street, people, overtaking; of rooms another lens"
         ),
     ] = False,
     motion: Annotated[
@@ -326,9 +326,8 @@ def simulate(
 
     Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
     """
-    from slam.simulation.kitti_layout import write_kitti_root
+    from slam.simulation.kitti_layout import simulated_world, write_kitti_root
     from slam.simulation.options import parse_options
-    from slam.simulation.worlds import simulated_world
 
     world = simulated_world(parse_options(route, frames, seed, width, height, hazards, varied, motion, rate))
     with progress_bar() as progress:

@@ -14,7 +14,7 @@ from erfsfm.inference import record_of_whole_weights
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
-from slam.sequences.truth import poses_beside
+from slam.sequences.poses import poses_beside
 
 IMPORTED = {
     "numpy": "numpy",

@@ -85,10 +85,9 @@ class DepthConfig(Section):
     png_scale: float = Field(
         default=256.0, gt=0, description="png: value of a pixel at a depth of 1 m; a pixel of 0 is unknown"
     )
-    refine: Literal["none", "multiview", "learned"] = Field(
+    refine: Literal["none", "learned"] = Field(
         default="learned",
-        description="the keyframes' depth by neighbouring images at the optimised poses; multiview: by rules; learned: "
-        "a network fuses both",
+        description="the keyframes' depth by neighbouring images at the optimised poses; learned: a network fuses both",
     )
     fusion: str = Field(default="default", description="learned: default, or an output folder of erfsfm train-fusion")
 

@@ -42,7 +42,7 @@ _FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners ov
 _CONTRADICTED_SPREAD = 0.007
 _LEAST_MOVED, _ALONG, _ASIDE_SPREAD = 0.1, np.cos(np.deg2rad(20.0)), 0.01  # of long steps; of their directions
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
-# of `share_right`, by tools/fit_confidence.py
+# of `share_right`, by tools/fit_confidence.py of commit 669cc2b1
 CONFIDENCE = (0.97, 3.0, 5.5)
 _CAPPED = 3.0  # sigmas of what leaves a confidence of less than a half
 

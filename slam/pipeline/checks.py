@@ -12,7 +12,7 @@ from slam.frontend.lidar_odometry import has_scans
 from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
 from slam.frontend.segments import named
 from slam.runtime.errors import SlamError
-from slam.sequences.growing import GrowingSequence
+from slam.sequences.recording import GrowingSequence
 
 logger = logging.getLogger(__name__)
 

@@ -8,11 +8,10 @@ from contextlib import closing
 import numpy as np
 
 from erfsfm.common.progress import Progress
-from erfsfm.mvs.refine import Decide, Road
+from erfsfm.mvs.refine import Decide
 from slam.config.sections import MappingConfig, SlamConfig
 from slam.frames import Intrinsics
 from slam.frontend.drive import Drive, Keyframe
-from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
@@ -93,7 +92,6 @@ class KeyframeDepths:
             guess_sigma: relative sigma of depth that was to be refined and has no neighbours; None where unknown.
         """
         self._keyframes: Sequence[Keyframe] = drive.keyframes
-        self._roads = drive.roads
         self._scale, self._T_world_camera, self._error = scale_per_frame, T_world_camera, error
         self._guess_sigma = None if decide is None else guess_sigma
         self._refiner: DepthRefiner | None = None
@@ -121,9 +119,7 @@ class KeyframeDepths:
         depth, unbiased = learned * np.float32(scale), (self._error.corrected(learned) * scale).astype(np.float32)
         refined = None
         if self._refiner is not None:
-            plane = self._roads[keyframe.index]
-            road = Road(plane.normal, plane.height_unscaled * scale) if isinstance(plane, GroundPlane) else None
-            refined = self._refiner.refine(n, unbiased, road)
+            refined = self._refiner.refine(n, unbiased)
         image, pose = keyframe.image, self._T_world_camera[keyframe.index]
         if refined is None:
             sigma = None if self._guess_sigma is None else np.full_like(unbiased, self._guess_sigma)

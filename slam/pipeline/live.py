@@ -26,8 +26,7 @@ from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH
 from slam.runtime.threads import Turns, in_turn
-from slam.sequences.growing import GrowingSequence
-from slam.sequences.recording import POSSIBLE_PERIODS_S
+from slam.sequences.recording import POSSIBLE_PERIODS_S, GrowingSequence
 
 
 class Slam:

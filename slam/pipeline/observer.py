@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from erfsfm.common.errors import COUNTED, OneLineError, explained, shows_traceback
+from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
 from slam.frontend.drive import Drive, Keyframe
@@ -386,7 +386,7 @@ class Observer:
         if is_se3(snippet.T_source_target):
             self.drive.snippets.append(snippet)
         else:
-            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE, extra=COUNTED)
+            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE)
 
     def _keep_rotation(self, rotation: Any) -> None:
         if rotation is not None:

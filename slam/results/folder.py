@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.metrics import Metrics
 from slam.results.output_folder import claim, stamped

@@ -17,9 +17,8 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.sequences.catalogue import open_sequence, sequence_kinds
-from slam.sequences.poses import known_poses
+from slam.sequences.poses import known_poses, poses_beside
 from slam.sequences.recording import RecordedSequence
-from slam.sequences.truth import poses_beside
 from slam.simulation.motion import Motion
 from slam.simulation.options import VERSION, RoomHazard
 

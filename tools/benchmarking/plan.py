@@ -60,7 +60,6 @@ _PARTS: dict[str, tuple[str, ...]] = {
 ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _PARTS.items()))
 _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "depth not refined": ("depth.refine=none",),
-    "depth refined by rules": ("depth.refine=multiview",),
     "no border": ("mapping.border=0",),
     "no sky": ("mapping.sky_brightness=256", "mapping.sky_blueness=256"),
     "range to 20 m, however sure": ("mapping.certain_range_factor=1",),

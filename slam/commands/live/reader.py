@@ -16,7 +16,7 @@ from slam.commands.live.source import Source
 from slam.frames import Frame, Image
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, explicit_camera
-from slam.sequences.growing import GrowingSequence
+from slam.sequences.recording import GrowingSequence
 from slam.sequences.undistortion import Undistortion, intrinsics_of
 
 INTERRUPTED, OVER = "it was interrupted", "the source ended"

@@ -14,7 +14,7 @@ from typing import Any, Literal, TextIO
 
 import numpy as np
 
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import raising_on_termination
 from slam.commands.live.reader import EXPECTED, StreamedSequence, calibration_of
 from slam.commands.live.source import open_source
@@ -36,7 +36,7 @@ from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
 from slam.sequences.camera_file import as_known
-from slam.sequences.growing import GrowingSequence
+from slam.sequences.recording import GrowingSequence
 from slam.sequences.undistortion import intrinsics_of
 
 logger = logging.getLogger(__name__)

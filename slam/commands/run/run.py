@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from erfsfm import __version__
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.progress import progress_bar, progress_lines, silent
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.common.threads import limit_library_threads

@@ -16,7 +16,6 @@ from erfsfm.common.errors import ConfigError, DataError, TrainingError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.data.prepared import INDEX_FILE
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.training.run import prepare, train, trained_on
 
@@ -138,14 +137,6 @@ def test_stops_stay_out(small: Small, write_raw: Callable[..., Path], tmp_path: 
         "kitti_raw/2011_10_03_drive_0099[0:6]",
         "kitti_raw/2011_10_03_drive_0099[9:15]",
     ]
-
-
-@pytest.mark.parametrize("text", ["recordings: 3", "{", "recordings: [{name: a, start: 0, frames: 1600000000}]"])
-def test_a_damaged_index_is_one_line(tmp_path: Path, text: str) -> None:
-    (tmp_path / INDEX_FILE).write_text(text)
-    with pytest.raises(DataError) as caught:
-        discover(tmp_path)
-    assert INDEX_FILE in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_the_command_says_how_to_go_on(write_root: Callable[..., Path], tmp_path: Path) -> None:

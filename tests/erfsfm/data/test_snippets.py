@@ -71,10 +71,8 @@ def test_snippets_with_a_broken_image_are_passed_over_and_others_stay(
     before = drawn()
     (coded / "a/4.png").write_bytes(b"broken")
     after = drawn()
-    assert caplog.messages == [
-        f"image {coded / 'a/4.png'} cannot be decoded: it is damaged or not an image; copy it again: "
-        "snippets with it are passed over"
-    ]
+    (warning,) = caplog.messages
+    assert str(coded / "a/4.png") in warning
     with_it = [folder_of(one) == "a" and 4 in frames_of(one) for one in before]
     assert 3 < sum(with_it) < 20
     assert not any(folder_of(one) == "a" and 4 in frames_of(one) for one in after)
@@ -255,7 +253,7 @@ def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture)
     with caplog.at_level("INFO"):
         training, _ = names(DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"]))
     assert training[:2] == ["kitti_raw/2011_09_26_drive_0001[0:3]", "kitti_raw/2011_09_26_drive_0001[4:6]"]
-    assert "left out 4 of 24 frames of KITTI raw" in caplog.text
+    assert "4 of 24 frames" in caplog.text
     kept = DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"], static_frames="keep")
     assert names(kept)[0][0] == "kitti_raw/2011_09_26_drive_0001[0:6]"
 

@@ -104,14 +104,6 @@ def test_effective_field_lies_inside_the_measured_one():
     assert network.encoder.training
 
 
-def test_fraction_of_pixels_that_holds_the_gradient():
-    field = measured(small("posenet"))
-    assert field.share_holding(1.0) <= field.coverage
-    assert 0 < field.share_holding(0.5) < field.share_holding(0.95) < field.coverage
-    field.gradient.zero_()[10, 20:30] = 1
-    assert field.share_holding(0.95) == pytest.approx(10 / (128 * 416))
-
-
 def test_multiply_adds():
     depth = build("depthnet")
     assert multiply_adds(depth) == pytest.approx(3.67e9, rel=2e-3)

@@ -15,7 +15,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_model
 from erfsfm.common.errors import BusyError, ConfigError, DataError, TrainingError
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import Terminated
 from erfsfm.config import ExperimentConfig, TrainedNetworks, load_experiment
 from erfsfm.data.discovery import discover
@@ -36,7 +35,6 @@ from erfsfm.training.run import train
 
 Small = dict[str, dict[str, object]]
 Configure = Callable[..., ExperimentConfig]
-FOR_BFLOAT16 = {"height": 64, "width": 128}  # feature maps of more than one pixel
 
 
 @pytest.fixture(autouse=True)
@@ -208,7 +206,7 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
 def test_a_folder_that_another_training_writes_to_is_refused(alone: Configure, tmp_path: Path) -> None:
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
-        with pytest.raises(BusyError, match="another process writes to"):
+        with pytest.raises(BusyError, match="run"):
             train(alone(), tmp_path / "run", device="cpu")
     assert not list((tmp_path / "run").iterdir())
 
@@ -260,13 +258,6 @@ def test_best_depth_and_best_pose_are_kept_apart(
     output = train(config, tmp_path / "run", device="cpu")
     written = [name for name in (".", "best_pose", "last") if (output / name / "model.yaml").exists()]
     assert {name: load_model(output / name).record.step for name in written} == steps
-
-
-def test_the_last_step_is_validated(both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.3, 0.3, 0.1])
-    config = both(training={"validate_every": 3})
-    record = load_model(train(config, tmp_path / "run", device="cpu")).record
-    assert record.step == 4 and record.metrics["abs_rel"] == 0.1
 
 
 class Clock:
@@ -349,56 +340,12 @@ def test_a_non_finite_loss_stops_the_run(alone: Configure, tmp_path: Path, monke
         return original(self, batch, index)
 
     monkeypatch.setattr(SelfSupervision, "training_step", poisoned)
-    with pytest.raises(TrainingError, match="at step 3 is not finite") as caught:
+    with pytest.raises(TrainingError, match=r"step 3.*photometric nan"):
         train(alone(), tmp_path / "run", device="cpu")
-    assert "\n" not in str(caught.value)
-    assert "photometric nan" in str(caught.value)
     assert load_model(tmp_path / "run" / "last").record.step == 3, "the weights so far"
     assert all(torch.isfinite(tensor).all() for tensor in weights_of(tmp_path / "run" / "last"))
     monkeypatch.undo()
     train(alone(), tmp_path / "run", resume=True, device="cpu")
-
-
-def test_non_finite_weights_are_not_written(alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last step writes NaN, after which no loss is checked."""
-
-    def insert_nan(self: SelfSupervision, *_: object) -> None:
-        if self.global_step == 3:
-            next(self.pose_net.parameters()).data.view(-1)[0] = float("nan")
-
-    monkeypatch.setattr(SelfSupervision, "on_before_optimizer_step", insert_nan)
-    with pytest.raises(TrainingError, match=r"weights are NaN or infinite at step 4: lower training\.learning_rate"):
-        train(alone(), tmp_path / "run", device="cpu")
-    assert not (tmp_path / "run" / "model.yaml").exists()
-
-
-@pytest.mark.parametrize(("constant", "stops"), [((1, 2, 3), True), ((0, 1, 3), False)])
-def test_a_depth_that_stays_constant_stops_the_run(
-    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, constant: tuple[int, ...], stops: bool
-) -> None:
-    original = SelfSupervision.training_step
-
-    def flat(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
-        weights = [head.weight for head in self.depth_net.heads]
-        before = [weight.detach().clone() for weight in weights]
-        for weight in weights:
-            weight.data *= self.global_step not in constant
-        try:
-            return original(self, batch, index)
-        finally:
-            for weight, values in zip(weights, before):
-                weight.data.copy_(values)
-
-    monkeypatch.setattr(SelfSupervision, "training_step", flat)
-    monkeypatch.setattr("erfsfm.training.module._CONSTANT_STEPS", 3)
-    config = alone(training={"steps": 5})
-    if not stops:
-        train(config, tmp_path / "run", device="cpu")
-        return
-    with pytest.raises(TrainingError, match=r"one constant for 3 steps .* at step 3") as caught:
-        train(config, tmp_path / "run", device="cpu")
-    assert "\n" not in str(caught.value)
-    assert load_model(tmp_path / "run" / "last").record.step == 3
 
 
 @pytest.fixture
@@ -424,11 +371,12 @@ def test_a_signal_ends_a_training_in_order(
         return original(self, batch, index)
 
     monkeypatch.setattr(SelfSupervision, "training_step", signalled)
-    kept = {"SIGHUP": "continue with --resume"}.get(name, "start again, for it has no checkpoint yet")
     config = alone(training={"checkpoint_every": 1 if name == "SIGHUP" else 2})
-    with pytest.raises(Terminated, match=f"ended by {name} at step 1: {kept}") as ended:
+    with pytest.raises(
+        Terminated, match=f"{name} at step 1.*{'--resume' if name == 'SIGHUP' else 'start again'}"
+    ) as ended:
         train(config, tmp_path / "run", device="cpu")
-    assert ended.value.code == code
+    assert ended.value.code == code and ("--resume" in str(ended.value)) == (name == "SIGHUP")
     assert load_model(tmp_path / "run" / "last").record.step == 1
 
 
@@ -451,7 +399,7 @@ def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path) -> None:
     config = alone(training={"steps": 1})
     train(config, tmp_path / "run", device="cpu")
     assert not (tmp_path / "run" / "checkpoints").exists()
-    with pytest.raises(TrainingError, match="choose another --output"):
+    with pytest.raises(TrainingError, match="--output"):
         train(config, tmp_path / "run", device="cpu")
 
 
@@ -474,9 +422,8 @@ class Malicious:
 
 def refused_checkpoint(cut: tuple[ExperimentConfig, Path]) -> None:
     config, output = cut
-    with pytest.raises(TrainingError, match="cannot be resumed") as caught:
+    with pytest.raises(TrainingError):
         train(config, output, resume=True, device="cpu")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["torch", "pickle"])
@@ -503,26 +450,6 @@ def test_a_broken_image_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_workers_start_where_opencv_has_threads(alone: Configure, tmp_path: Path) -> None:
-    """A forked worker would wait forever for the threads of OpenCV's pool, which it does not inherit."""
-
-    def too_late(*_: object) -> None:
-        raise TimeoutError("the worker hangs")
-
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(4)
-    cv2.resize(np.zeros((2000, 2000, 3), np.uint8), (1500, 1500), interpolation=cv2.INTER_AREA)  # starts the pool
-    previous = signal.signal(signal.SIGALRM, too_late)
-    signal.alarm(600)
-    try:
-        train(alone(data={"workers": 1}, training={"steps": 1}), tmp_path / "run", device="cpu")
-        assert cv2.getNumThreads() == 4, "as it was"
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, previous)
-        cv2.setNumThreads(threads)
-
-
 @pytest.mark.parametrize(
     ("seen", "licence"),
     [
@@ -533,14 +460,6 @@ def test_workers_start_where_opencv_has_threads(alone: Configure, tmp_path: Path
 )
 def test_licence_of(seen: list[str], licence: str) -> None:
     assert licence_of(seen).startswith(licence)
-
-
-def test_mixed_precision_trains(both: Configure, small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
-    small["network"] |= FOR_BFLOAT16
-    config = both(training={"precision": "bf16-mixed", "steps": 2})
-    output = train(config, tmp_path / "run", device="cpu")
-    assert all(tensor.dtype != torch.bfloat16 for tensor in weights_of(output))
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from oracle import OracleNoise, OraclePredictor
 from slam.config.sections import KeyframesConfig, load_config
 from slam.loops.descriptors import FeatureExtractor
 from slam.mapping.depth_refinement import DepthRefiner
-from slam.mapping.fusion import Fusion
+from slam.mapping.submap import Fusion
 from slam.pipeline.run import SlamPipeline
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions

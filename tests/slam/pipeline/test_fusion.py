@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from erfsfm.mvs.refine import by_rules
+from erfsfm.mvs.fusion import DepthFusion
 from slam.config.sections import MappingConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
@@ -29,7 +29,7 @@ def depths(step: float, guess_sigma: float | None, refined: bool = True) -> Keyf
     )
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)
-    scale, decide = np.full(FRAMES, 2.0), by_rules if refined else None
+    scale, decide = np.full(FRAMES, 2.0), DepthFusion("default").decide if refined else None
     return KeyframeDepths(drive, scale, T_world_camera, DepthError(), CAMERA, decide, guess_sigma)
 
 

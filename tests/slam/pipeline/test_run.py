@@ -27,7 +27,7 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
-from slam.prediction.networks import NetworkPredictor
+from slam.prediction.assembly import NetworkPredictor
 from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import Excerpt

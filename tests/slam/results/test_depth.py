@@ -5,8 +5,8 @@ import numpy as np
 from slam.frames import Intrinsics
 from slam.mapping.filters import KeyframeDepth
 from slam.results.depth import DepthQuality, projected, true_depth
-from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.excerpt import Excerpt
+from slam.sequences.images import DepthMaps
 from slam.sequences.recording import RecordedSequence, Source
 
 CAMERA = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5)

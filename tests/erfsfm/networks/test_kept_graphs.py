@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from torch import Tensor, nn
 
-from erfsfm.networks import graph_folder
-from erfsfm.networks.graph_folder import folder, keep, kept
-from erfsfm.networks.onnx_graph import Array, OnnxGraph
+from erfsfm.networks import onnx_graph
+from erfsfm.networks.onnx_graph import Array, OnnxGraph, folder, keep, kept
 
 NO_CODE = shutil.ignore_patterns("weights", "__pycache__")
 IMAGE = np.ones((1, 3, 4, 4), np.float32)
@@ -62,8 +61,8 @@ def test_a_damaged_graph_is_made_again() -> None:
 
 @pytest.mark.parametrize("changed", ["networks/blocks.py", "geometry/alignment.py"])
 def test_a_graph_of_older_code_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
-    package = shutil.copytree(Path(graph_folder.__file__).parents[1], tmp_path / "code", ignore=NO_CODE)
-    monkeypatch.setattr(graph_folder, "__file__", str(package / "networks" / "graph_folder.py"))
+    package = shutil.copytree(Path(onnx_graph.__file__).parents[1], tmp_path / "code", ignore=NO_CODE)
+    monkeypatch.setattr(onnx_graph, "__file__", str(package / "networks" / "onnx_graph.py"))
     assert kept_graph("one", b"old") == b"old" == kept_graph("one", b"new")
     (package / changed).write_text("# changed")
     assert kept_graph("one", b"new") == b"new"

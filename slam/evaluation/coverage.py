@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,19 +17,12 @@ from slam.runtime.errors import SlamError
 LEVELS = (50, 90, 95)
 
 
-@dataclass(frozen=True)
-class Coverage:
-    """Ratio of factors inside their own bounds, by level in percent: ``{"50": 0.49, ...}``.
+def coverage(
+    relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float
+) -> dict[str, dict[str, float]]:
+    """Ratio of factors whose error lies inside the 50, 90 and 95 % bound of their stated noise, ``{"50": 0.49, ...}``.
 
-    ``by_source`` has the same for the factors of each source, and their number under ``factors``.
-    """
-
-    overall: dict[str, float]
-    by_source: dict[str, dict[str, float]]
-
-
-def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float) -> Coverage:
-    """Ratio of factors whose error lies inside the 50, 90 and 95 % bound of their stated noise.
+    Under ``""`` of all of them, and by source, there with their number under ``factors``.
 
     Args:
         relative_poses: measurements with their noise, at least one.
@@ -51,13 +43,10 @@ def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatA
         bounds = np.array([squared_bound(level / 100, dof) for dof in dofs])
         inside[str(level)] = squared <= bounds[dof_of_factor]  # (F,)
     sources = np.array([edge.source for edge in relative_poses])
-    return Coverage(
-        overall=_ratios(inside, np.ones(len(sources), dtype=bool)),
-        by_source={
-            str(source): {"factors": int((sources == source).sum()), **_ratios(inside, sources == source)}
-            for source in np.unique(sources)
-        },
-    )
+    found = {"": _ratios(inside, np.ones(len(sources), dtype=bool))}
+    for source in np.unique(sources):
+        found[str(source)] = {"factors": int((sources == source).sum()), **_ratios(inside, sources == source)}
+    return found
 
 
 def squared_bound(probability: float, student_t_dof: float) -> float:

@@ -149,16 +149,10 @@ class MapDistances:
         return self._of(self.in_field, np.ones(len(self.to_map), dtype=bool))
 
 
-@dataclass(frozen=True)
-class MapComparison:
-    """Distances by name of the placed map, and the length of road that was looked at."""
-
-    distances: Mapping[str, MapDistances]
-    length_m: float
-
-
-def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, FloatArray]) -> MapComparison:
-    """Distances between maps and the true surface, one stretch of road at a time.
+def compare(
+    truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, FloatArray]
+) -> tuple[dict[str, MapDistances], float]:
+    """Distances between maps and the true surface by name, and the length of road looked at, stretch by stretch.
 
     Args:
         truth: the surface.
@@ -180,7 +174,7 @@ def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, 
             in_field, to_map = truth.in_field(points[own], near), _to_map(on_surface, points)
             found[name].append(MapDistances(distances, away[own], in_field, to_map, surface_range))
         del to_surface  # it holds the surface
-    return MapComparison({name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts))
+    return {name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts)
 
 
 _Kind = TypeVar("_Kind", bound=SurfaceMetrics)

@@ -189,7 +189,7 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: if a limit is malformed or there is no such metric.
     """
-    lines, names, tree = [], AlignedMetrics.names(), metrics.tree()
+    lines, names = [], AlignedMetrics.names()
     for limit in limits:
         name, _, text = (part.strip() for part in limit.partition("="))
         try:
@@ -199,26 +199,20 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
         if not name or math.isnan(most):
             raise ConfigError(f"a limit is METRIC=VALUE with a number for VALUE; got '{limit}'")
         path = f"align.7dof.{name}" if name in names else name
-        section, _, key = path.rpartition(".")
-        if path not in _metric_paths():
+        try:
+            value, reason = metrics.at(path)
+        except AttributeError:
+            value, reason = "", ""
+        if not isinstance(value, float | int | None):
             raise ConfigError(
                 f"there is no metric '{name}'; use {', '.join(names)} (under 7dof), "
                 f"align.{{{','.join(ALIGNMENTS)}}}.NAME, snippet5.NAME or evo.NAME"
             )
-        record: Any = tree
-        for name in section.split("."):
-            record = record[name]
-        if record[key] is None:
-            lines.append(f"{path} is not known ({record.get(f'{key}_reason')}), limit {most:g}")
-        elif record[key] > most:
-            lines.append(f"{path} is {record[key]:.6g}, over the limit {most:g}")
+        if value is None:
+            lines.append(f"{path} is not known ({reason}), limit {most:g}")
+        elif value > most:
+            lines.append(f"{path} is {value:.6g}, over the limit {most:g}")
     return lines
-
-
-def _metric_paths() -> set[str]:
-    """Every dotted path to a number of T."""
-    paths = {f"align.{name}.{key}" for name in ALIGNMENTS for key in AlignedMetrics.names()}
-    return paths | {f"snippet5.{key}" for key in SnippetMetrics.names()} | {f"evo.{key}" for key in EvoMetrics.names()}
 
 
 def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:

@@ -180,8 +180,8 @@ def _graph(result: Estimate) -> GraphMetrics:
         still = Failed("the estimate does not move: the truth cannot be scaled to it")
         return GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=still)
     covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
-    by_source = {source: CoverageMetrics.model_validate(shares) for source, shares in covered.by_source.items()}
-    overall = CoverageMetrics.model_validate(covered.overall)
+    by_source = {source: CoverageMetrics.of(**shares) for source, shares in covered.items()}
+    overall = by_source.pop("")
     return GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
 
 

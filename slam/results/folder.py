@@ -65,11 +65,6 @@ class RunFolder:
         Raises:
             RunError: no run there.
         """
-        return cls.open_with_metrics(path)[0]
-
-    @classmethod
-    def open_with_metrics(cls, path: str | Path) -> tuple[RunFolder, Metrics]:
-        """As `open`, with its `metrics`, which are read once."""
         path = Path(path)
         if not (path / METRICS).is_file() and not (path / ESTIMATE).is_file():
             what = "no such folder" if not path.exists() else f"it holds no {METRICS}"
@@ -78,7 +73,7 @@ class RunFolder:
         metrics = folder.metrics()
         if metrics.failure:
             logger.warning("%s: %s: files that are there are whole", path, metrics.failure)
-        return folder, metrics
+        return folder
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file atomically."""

@@ -171,17 +171,17 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
     cameras = cKDTree(sequence.reference[looked_at, :3, 3])
     placed = {name: _placed(pieces(), fit, cameras) for name, fit in fits.items()}
     try:
-        found = compare(truth, sequence.reference, placed)
+        distances, length_m = compare(truth, sequence.reference, placed)
     except SlamError as error:
         logger.warning("the error of the map is not known: %s", error)
         return MapMetrics.unknown(str(error), *MAP_ERRORS)
-    if truth.distance is None and len(found.distances["with_scale"].to_map) == 0:
+    if truth.distance is None and len(distances["with_scale"].to_map) == 0:
         return MapMetrics.unknown("no point of the true surface is known near the images", *MAP_ERRORS)
-    with_scale = placed_metrics(PlacedMetrics, found.distances["with_scale"], scale=fits["with_scale"].scale)
-    more = {"truth": truth.name, "evaluated_m": found.length_m, "with_scale": with_scale}
+    with_scale = placed_metrics(PlacedMetrics, distances["with_scale"], scale=fits["with_scale"].scale)
+    more = {"truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
     if unmetric:
         return MapMetrics.of(**dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale")), **more)
-    return placed_metrics(MapMetrics, found.distances["rigid"], **more)
+    return placed_metrics(MapMetrics, distances["rigid"], **more)
 
 
 def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> FloatArray:

@@ -223,7 +223,7 @@ def test_evaluate_depth(run: Run, tmp_path: Path, weights: Path, write_root: Cal
     assert median["abs_rel"] < 0.02
     code, out, _ = run("evaluate", "depth", "--weights", weights, "--dataset", root)
     assert code == 0
-    head, *rows = out.splitlines()
+    head, _, *rows = [line.strip() for line in out.splitlines() if line.strip()]
     assert head.split()[:2] == ["method", "abs_rel"] and [row[: len("median depth map")] for row in rows] == [
         "networks        ",
         "median depth map",

@@ -37,7 +37,7 @@ def factors(student_t_dof: float) -> list[RelativePose]:
 
 @pytest.mark.parametrize("student_t_dof", [math.inf, 12.0, 4.0])
 def test_noise_with_the_stated_sigmas_is_covered(student_t_dof: float) -> None:
-    ratios = coverage(factors(student_t_dof), truth(), 1.0).overall
+    ratios = coverage(factors(student_t_dof), truth(), 1.0)[""]
     assert ratios == {
         "50": pytest.approx(0.5, abs=0.03),
         "90": pytest.approx(0.9, abs=0.02),
@@ -46,9 +46,9 @@ def test_noise_with_the_stated_sigmas_is_covered(student_t_dof: float) -> None:
 
 
 def test_unstated_heavy_tails_change_the_coverage() -> None:
-    ratios = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0).overall
+    ratios = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0)[""]
     assert ratios["50"] > 0.65 and ratios["95"] < 0.94
-    ratios = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0).overall
+    ratios = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0)[""]
     assert ratios["50"] < 0.3
 
 
@@ -64,7 +64,7 @@ def test_the_scale_is_known() -> None:
     ratios = coverage(edges, metric, 1.0)
     metric[:, :3, 3] *= 4.0
     assert coverage(edges, metric, 0.25) == ratios
-    assert coverage(edges, metric, 1.0).overall["95"] < 0.1
+    assert coverage(edges, metric, 1.0)[""]["95"] < 0.1
     for bad in (([], 1.0), (edges, 0.0)):
         with pytest.raises(SlamError):
             coverage(bad[0], metric, bad[1])
@@ -73,14 +73,14 @@ def test_the_scale_is_known() -> None:
 def test_overconfident_factors_are_found_by_source() -> None:
     honest = factors(math.inf)
     boasting = [replace(f, sigmas=f.sigmas / 10, source=LOOP_SOURCE) for f in honest[:100]]
-    kinds = coverage(honest + boasting, truth(), 1.0).by_source
-    assert kinds.keys() == {"network", LOOP_SOURCE}
+    kinds = coverage(honest + boasting, truth(), 1.0)
+    assert kinds.keys() == {"", "network", LOOP_SOURCE}
     assert kinds[LOOP_SOURCE]["factors"] == 100 and kinds[LOOP_SOURCE]["95"] < 0.2
-    assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0).overall}
+    assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0)[""]}
 
 
 def test_each_factor_has_the_bound_of_its_own_distribution() -> None:
     normal, heavy = factors(math.inf), [replace(f, source="essential") for f in factors(4.0)]
     covered = coverage(normal + heavy, truth(), 1.0)
-    for level, ratio in covered.overall.items():
-        assert ratio == pytest.approx(np.mean([kind[level] for kind in covered.by_source.values()]))
+    for level, ratio in covered[""].items():
+        assert ratio == pytest.approx(np.mean([kind[level] for source, kind in covered.items() if source]))

@@ -164,7 +164,7 @@ def test_stated_noise_of_the_network_holds() -> None:
     for seed in range(3):
         steps = seen_by_network(T, seed=seed)
         factors = network_factors(steps, calibrate_network(steps, measured(T), DEPTH_UNIT))
-        inside.append(coverage(factors, T, 1.0).overall)
+        inside.append(coverage(factors, T, 1.0)[""])
     for level, least, most in (("50", 0.4, 0.65), ("90", 0.85, 0.97), ("95", 0.91, 0.99)):
         assert least < np.mean([each[level] for each in inside]) < most
 

@@ -145,7 +145,7 @@ def test_a_run_opens_by_its_name_and_shows_itself(make_run: MakeRun) -> None:
     run = slam.RunFolder(str(path))
     assert run.path == path and len(run.mesh().vertices) == 3
     shown = run._repr_html_()
-    assert "<th>ATE RMSE, 7 dof</th>" in shown and "<td>optimised</td>" in shown and "<script" not in shown
+    assert "7dof" in shown and "<td>optimised</td>" in shown and "<script" not in shown
     (path / "map_mesh.ply").unlink()
     with pytest.raises(RunError, match=r"has no map_mesh\.ply"):
         run.mesh()

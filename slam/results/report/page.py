@@ -100,7 +100,7 @@ def write_report(
         gps=_html(tables.gps(metrics)),
         depths=depths,
         depth_error=_html(tables.depth_error(metrics)),
-        map_tables=[_html(tables.map_errors(metrics)), _html(tables.map_left_out(metrics))],
+        map_tables=_html(tables.map_errors(metrics)) + _html(tables.map_left_out(metrics)),
         no_map=_absence(metrics, metrics.map.absent or ("" if has_map else metrics.map.why("triangles"))),
         loops=tables.loop_counts(metrics),
         loop_pictures=loops,

@@ -18,26 +18,6 @@ class VisualOdometryConfig(Section):
     enabled: bool = Field(default=True, description="measure relative poses by image geometry")
     max_corners: int = Field(default=800, ge=50, le=10000, description="largest number of tracked corners")
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners, pixels")
-    few_corners: int = Field(
-        default=60,
-        ge=0,
-        description="number of tracks below which tracking is repeated with the wide window and equalised exposure",
-    )
-    predicted_flow: bool = Field(
-        default=True,
-        description="track in the later image warped back by the flow that learned depth and the last motion predict",
-    )
-    rotation_baseline_steps: int = Field(
-        default=2,
-        ge=1,
-        le=3,
-        description="frames between which relative rotation is also measured directly; 1: neighbours alone",
-    )
-    dynamic_mask_sharpness: float = Field(
-        default=4.0,
-        ge=0,
-        description="exponent on the local inlier ratio that weighs corners down on dynamic objects; 0: off",
-    )
     min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
 
 

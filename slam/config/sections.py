@@ -126,15 +126,6 @@ class LoopsConfig(Section):
     enabled: bool = Field(default=True, description="detect and close loops")
     frame_stride: int = Field(default=4, ge=1, description="frames between those that are described and compared")
     min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
-    agreement_deg: float = Field(
-        default=2.0, gt=0, description="largest difference of the rotations measured in both directions, degrees"
-    )
-    agreement_ratio: float = Field(
-        default=0.1,
-        gt=0,
-        description="largest difference of the translations measured in both directions, over the depth",
-    )
-    min_support: int = Field(default=2, ge=0, description="least number of images whose loops support a loop")
 
 
 class MappingConfig(Section):

@@ -58,6 +58,8 @@ OF_KEYFRAMES = Search(side=15, levels=3, limits=(15, 0.02), back=(1, (10, 0.05))
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
+ROTATION_BASELINE = 2  # steps between frames whose rotation is also measured directly: halves its error
+FEW_CORNERS = 60  # tracks below which they are sought again, with the wide window and equal exposure
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 _STEP_QUALITY, _STEP_BLOCK_PX = 0.008, 5
 
@@ -189,7 +191,7 @@ class CornerTracker:
         self._config = config
         self._corners: dict[int, Corners] = {}  # of the last frames
         self._next_track_id = 0
-        self._frames_kept = config.rotation_baseline_steps + 2
+        self._frames_kept = ROTATION_BASELINE + 2
 
     def track(
         self,
@@ -239,7 +241,7 @@ class CornerTracker:
         """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
         flows = [predicted_flow, None] if predicted_flow else [None]
         pixels, kept = _by_first_flow(first.grey, second.grey, points, flows)
-        if kept.sum() < self._config.few_corners:
+        if kept.sum() < FEW_CORNERS:
             exposed = _histogram_matched(second.grey, first.grey)
             pixels_wide, kept_wide = _by_first_flow(first.grey, exposed, points, flows, _WIDE_WINDOW_PX)
             if kept_wide.sum() > kept.sum():

@@ -51,9 +51,9 @@ class LoopThresholds:
     """
 
     min_inliers: int
-    agreement_deg: float
-    agreement_ratio: float
-    min_support: int
+    agreement_deg: float = 2.0
+    agreement_ratio: float = 0.1
+    min_support: int = 2
     candidates: int = 2
     candidate_spacing: int = 10
     least_score: float = 0.2
@@ -71,7 +71,7 @@ class LoopThresholds:
     @classmethod
     def of_frames(cls, config: LoopsConfig) -> Self:
         """The conditions of loops between frames of a drive."""
-        return cls(config.min_inliers, config.agreement_deg, config.agreement_ratio, config.min_support)
+        return cls(config.min_inliers)
 
 
 # keyframes' points are exact within a map that drifts, their descriptors further apart in distance and roll

@@ -22,6 +22,7 @@ from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
+from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState, VisualOdometry
 from slam.geometry.se3 import FloatArray, chain, is_se3
@@ -109,7 +110,6 @@ class Observer:
             camera_height_m: above the road; None where unknown.
         """
         self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
-        self._baseline = config.visual_odometry.rotation_baseline_steps
         self.drive = Drive()  # the measurements so far
         self._gate = ImageGate()
         self._odometry = VisualOdometry(config.visual_odometry, intrinsics, seed)
@@ -291,7 +291,7 @@ class Observer:
         self._finish_tasks()
         self._keyframes.choose(drive)
         drive.roads.append(MeasurementFailure("its depth was not predicted"))
-        self._recent = (*self._recent, current)[-self._baseline :]
+        self._recent = (*self._recent, current)[-ROTATION_BASELINE:]
         if current.snippet is not None:
             self._tasks.append(Task("pose network", current.snippet, self._keep_snippet))
         if rotation is not None:
@@ -359,12 +359,12 @@ class Observer:
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
         """Prepare to measure the rotation across the last steps, if all of them were triangulated."""
-        if self._baseline < 2 or len(self._recent) < self._baseline:
+        if len(self._recent) < ROTATION_BASELINE:
             return None
-        first = self._recent[-self._baseline]
-        motions = {m.ends: m for m in self.drive.motions[-2 * self._baseline :] if m.is_triangulated}
+        first = self._recent[-ROTATION_BASELINE]
+        motions = {m.ends: m for m in self.drive.motions[-2 * ROTATION_BASELINE :] if m.is_triangulated}
         path = path_between(shortest_by_start(motions), first.frame.index, current.index)
-        if path is None or len(path) != self._baseline:
+        if path is None or len(path) != ROTATION_BASELINE:
             return None
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
         return self._odometry.relative_rotation(first.frame, current, self._depth_of(first), T_first_current)

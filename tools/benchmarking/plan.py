@@ -39,22 +39,15 @@ class Configuration:
     overrides: tuple[str, ...] = ()
 
 
-_NEVER = 1e9  # a limit that no measurement reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 WHOLE = (Configuration("no map", (*QUIET, "mapping.enabled=false")),)
 EVERYTHING = Configuration("everything on", QUIET)
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("visual_odometry.enabled=false",),
-    "no predicted flow": ("visual_odometry.predicted_flow=false",),
-    "no relative rotation over two steps": ("visual_odometry.rotation_baseline_steps=1",),
-    "no dynamic mask": ("visual_odometry.dynamic_mask_sharpness=0",),
-    "no second search with a wide window": ("visual_odometry.few_corners=0",),
     "no lengths from the road homography": ("road.enabled=false",),
     "no gap interpolation": ("gaps.enabled=false",),
     "no loops": ("loops.enabled=false",),
-    "no consistency among loops": ("loops.min_support=0",),
-    "no agreement of a loop in both directions": ("loops.agreement_deg=180", f"loops.agreement_ratio={_NEVER}"),
     "no fusion": ("mapping.enabled=false",),
 }
 ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _PARTS.items()))

@@ -61,6 +61,7 @@ ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
 _MIN_RATIOS = 8
+_MASK_SHARPNESS = 4.0  # exponent on the local inlier ratio that weighs corners down on moving objects
 _PNP_ITERATIONS = 200
 _LEAST_PNP_SHARE = 0.5  # of the corners: what fewer agree on is chance
 _LEARNED_RELATIVE_SIGMA = 0.1
@@ -116,7 +117,7 @@ class VisualOdometry:
         self._tracker = CornerTracker(config)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, seed)
         self._state = OdometryState(
-            DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),
+            DynamicMask.empty(intrinsics.width, intrinsics.height, _MASK_SHARPNESS),
             MotionHistory(),
             DepthError(),
         )
@@ -213,7 +214,7 @@ class VisualOdometry:
     def _predicted_flow(self, previous: Frame, current: Frame, depth_previous: DepthMap) -> PredictedFlow | None:
         """By the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames."""
         last = self._state.last
-        if not self._config.predicted_flow or last is None or last.ends[1] != previous.index:
+        if last is None or last.ends[1] != previous.index:
             return None
         if last.ends[1] - last.ends[0] != current.index - previous.index:
             return None

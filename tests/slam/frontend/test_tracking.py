@@ -46,10 +46,12 @@ def test_new_corners_are_detected_in_what_slides_into_view(frames):
     assert len(tracks.track_ids) <= CONFIG.max_corners
 
 
-def test_few_corners_are_tracked_again_with_equal_exposure(frames):
+def test_few_corners_are_tracked_again_with_equal_exposure(frames, monkeypatch):
     dark = Frame(1, 0.1, (0.35 * frames[1].image.astype(np.float32)).astype(np.uint8))
-    once = CornerTracker(CONFIG.model_copy(update={"few_corners": 0})).track(frames[0], dark)
-    again = CornerTracker(CONFIG.model_copy(update={"few_corners": 1000})).track(frames[0], dark)
+    monkeypatch.setattr("slam.frontend.tracking.FEW_CORNERS", 0)
+    once = CornerTracker(CONFIG).track(frames[0], dark)
+    monkeypatch.setattr("slam.frontend.tracking.FEW_CORNERS", 1000)
+    again = CornerTracker(CONFIG).track(frames[0], dark)
     assert len(again.track_ids) > max(2 * len(once.track_ids), 40)
     error = np.abs(again.previous - again.current - [SHIFT_PX, 0]).max(axis=1)
     assert np.median(error) < 0.1

@@ -48,8 +48,8 @@ def street(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def request_of(camera: Path | str, weights: Path, settings: Sequence[str], output: Path, **options: Any) -> LiveRequest:
-    return LiveRequest(str(camera), output=output, weights=str(weights), overrides=list(settings), **options)
+def request_of(source: Path | str, weights: Path, settings: Sequence[str], output: Path, **options: Any) -> LiveRequest:
+    return LiveRequest(str(source), output=output, weights=str(weights), overrides=list(settings), **options)
 
 
 def fill(source: Path, target: Path, messages: list[dict[str, Any]], vanishes: bool = True) -> None:

@@ -78,4 +78,4 @@ publish: dist
 	$(BIN)/python -m twine upload dist/*
 
 clean:
-	rm -rf $(VENV) $(DOCS) results runs dist build site
+	rm -rf $(VENV) $(DOCS) dist build site

@@ -12,38 +12,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from erfsfm import __version__
 from erfsfm.cli_evaluate import evaluate_app
 from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights
 from erfsfm.cli_train import train, train_fusion
 from erfsfm.common import command_line
+from erfsfm.common.table import Table
 
 logger = logging.getLogger(__name__)
 
-app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    help="Self-supervised depth and ego-motion networks with wide receptive fields.",
-)
+app = command_line.application("erfsfm", "Self-supervised depth and ego-motion networks with wide receptive fields.")
 app.add_typer(evaluate_app, name="evaluate")
 app.command()(train)
 app.command("train-fusion")(train_fusion)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"erfsfm {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
-    ] = False,
-) -> None:
-    """Options before a command."""
 
 
 @app.command()
@@ -122,10 +102,11 @@ def networks(
     if as_json:
         typer.echo(json.dumps(summaries, indent=2))
         return
-    typer.echo(f"{'network':24}{'parameters':>12}{'multiply-adds':>15}{'receptive field':>17}")
+    rows = []
     for row in summaries:
         work = f"{row['multiply_adds'] / 1e9:.2f} G" if row["multiply_adds"] is not None else "impossible"
-        typer.echo(f"{row['name']:24}{row['parameters']:>12,}{work:>15}{row['receptive_field']:>14} px")
+        rows.append([row["name"], f"{row['parameters']:,}", work, f"{row['receptive_field']} px"])
+    Table(["network", "parameters", "multiply-adds", "receptive field"], rows).print()
 
 
 @app.command("receptive-field")
@@ -157,8 +138,7 @@ def receptive_field(
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
     from erfsfm.receptive_field.figure import draw_fields
-    from erfsfm.receptive_field.measure import field_table, measure_fields
-    from erfsfm.receptive_field.street import street_snippet
+    from erfsfm.receptive_field.measure import field_table, measure_fields, street_snippet
 
     require_figure(output)
     if images is None:
@@ -177,7 +157,7 @@ def receptive_field(
     if as_json:
         typer.echo(json.dumps([row.summary() for row in rows], indent=2))
         return
-    typer.echo(field_table(rows))
+    field_table(rows).print()
     typer.echo(f"picture in {output}")
 
 

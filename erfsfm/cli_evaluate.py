@@ -10,7 +10,9 @@ import typer
 
 from erfsfm.cli_options import Device, Fidelity, Json, UnusedSeed, Weights, print_rows
 
-evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of trained networks.")
+evaluate_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Depth and pose errors of trained networks."
+)
 
 
 @evaluate_app.command("depth")
@@ -18,7 +20,9 @@ def evaluate_depth(
     dataset: Annotated[
         list[Path], typer.Option(help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat")
     ],
-    weights: Weights = "default",
+    weights: Annotated[
+        list[str], typer.Option(help="a shipped name (default, sim) or a training output folder; repeat to compare")
+    ] = ["default"],  # noqa: B006
     truth: Annotated[
         Literal["measured", "many-views"],
         typer.Option(help="many-views: measured by optical flow at the poses of a run, for drives without true depth"),
@@ -42,10 +46,11 @@ def evaluate_depth(
 ) -> None:
     """Depth errors under 80 m: Eigen's protocol with --split, else every fifth frame, and every street counts alike.
 
-    The table has the standard error of abs_rel by blocks of consecutive images; JSON has all errors. With --truth
-    many-views no true depth is needed: static surfaces are measured from their neighbouring frames.
+    Standard errors are those over streets. Several weights are compared by the ratio of their abs_rel to that of the
+    first on each street, and by the geometric mean of the ratios. JSON has all errors. With --truth many-views no true
+    depth is needed: static surfaces are measured from their neighbouring frames.
 
-    Example: erfsfm evaluate depth --weights sim --dataset worlds --dataset KITTI_RAW --output depth.json
+    Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
     from erfsfm.common.errors import ConfigError
     from erfsfm.common.progress import progress_bar
@@ -62,12 +67,15 @@ def evaluate_depth(
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
     if len(dataset) > 1 and (truth == "many-views" or split is not None):
         raise ConfigError(f"--split and --truth many-views take one --dataset; got {len(dataset)}")
-    predictor = DepthPosePredictor.from_weights(weights, device)
+    if len(weights) > 1 and (truth == "many-views" or split is not None):
+        raise ConfigError(f"--split and --truth many-views take one --weights; got {len(weights)}")
+    networks = {name: DepthPosePredictor.from_weights(name, device) for name in weights}
+    predictor = networks[weights[0]]
     with progress_bar() as show:
         if truth == "many-views":
             rows = many_view_protocol(predictor, dataset[0], sequence or (), cache, allow_leak, show)
         elif split is None:
-            rows = depth_protocol(predictor, dataset, allow_leak, show)
+            rows = depth_protocol(networks if len(networks) > 1 else {"networks": predictor}, dataset, allow_leak, show)
         else:
             rows = eigen_protocol(predictor, dataset[0], split, fidelity, allow_leak)
     _show(rows, output, as_json)
@@ -79,15 +87,24 @@ def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> Non
 
     if output is not None:
         write_atomically(output, lambda path: path.write_text(json.dumps(rows, indent=2) + "\n"))
-    print_rows(rows if as_json else [_narrow(row) for row in rows], as_json)
+    print_rows(rows if as_json else _narrow(rows), as_json)
 
 
-def _narrow(row: dict[str, Any]) -> dict[str, Any]:
-    """What of a street's row fits into a table of 80 columns; another row as it is."""
-    if "abs_rel_se" not in row:
-        return row
-    shown = {"method": row.get("street", row["method"]), "abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
-    return shown | {key: row[key] for key in ("rmse", "a1", "images", "leak")}
+def _narrow(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What of streets' rows fits into a table of 80 columns; other rows as they are."""
+    if "abs_rel_se" not in rows[0]:
+        return rows
+    compares = any("ratio" in row for row in rows)
+    shown = []
+    for row in rows:
+        head = {"street": row.get("street", "mean"), "weights": row["method"]}
+        errors = {"abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
+        if compares:
+            shown.append(head | errors | {"ratio": row.get("ratio"), "ratio se": row.get("ratio_se")})
+        else:
+            errors |= {key: row[key] for key in ("rmse", "a1", "images", "leak")}
+            shown.append({"method": row.get("street", row["method"])} | errors)
+    return shown
 
 
 @evaluate_app.command("pose")

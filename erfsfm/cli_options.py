@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from erfsfm.common.table import table_of
+
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
 UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")]
@@ -16,16 +18,8 @@ Fidelity = Annotated[Literal["default", "paper"], typer.Option(help="paper: exac
 
 
 def print_rows(rows: list[dict[str, Any]], as_json: bool) -> None:
-    """A table with a row a line and the keys as its head, numbers to the right; or JSON."""
+    """A table with a row a line and the keys as its head; or JSON."""
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
-        return
-    columns = []
-    for key in dict.fromkeys(key for row in rows for key in row):
-        values = ["-" if row.get(key) is None else row[key] for row in rows]
-        cells = [key, *(f"{value:.4f}" if isinstance(value, float) else str(value) for value in values)]
-        width = max(map(len, cells))
-        is_text = all(isinstance(value, str) for value in values)
-        columns.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in cells])
-    for line in zip(*columns):
-        typer.echo("  ".join(line).rstrip())
+    else:
+        table_of(rows).print()

@@ -94,6 +94,9 @@ class DataConfig(Section):
     validation_snippets: int = Field(default=60, ge=1, description="number of snippets in each validation")
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
     zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
+    roll: float = Field(
+        default=0.0, ge=0, le=30, description="largest roll of the camera in labelled single images, degrees"
+    )
     colour_jitter: float = Field(
         default=0.0, ge=0, le=0.5, description="largest relative change of brightness, contrast, gamma"
     )
@@ -277,6 +280,11 @@ class ExperimentConfig(Section):
             raise ValueError(
                 "data.exact needs teacher.views: many or network, whose lengths have the unit of exact depth, and a "
                 "teacher.structure_weight above 0"
+            )
+        if self.data.exact > 0 and self.training.of_batch(self.data.exact) == 0:
+            raise ValueError(
+                f"data.exact: {self.data.exact:g} of a batch of {self.training.batch} is less than one sample: set "
+                f"data.exact={1 / self.training.batch:g} or more, or a larger training.batch"
             )
         by_motion = self.training.networks != "depth" or self.loss.photometric_weight > 0
         if self.teacher.views == "network" and (by_motion or self.teacher.structure_weight == 0):

@@ -21,8 +21,8 @@ from erfsfm.common.errors import ExportError
 from erfsfm.common.files import is_foreign, write_atomically
 from erfsfm.common.onnx_session import open_session
 from erfsfm.config import NetworkConfig
-from erfsfm.networks.onnx_export import exported
 from erfsfm.networks.presets import NetworkKind
+from erfsfm.networks.torch_network import exported
 
 # of the largest output; a thousand roundings of float32
 TOLERANCE = 1e-4

@@ -9,15 +9,25 @@ from erfsfm import DISTRIBUTION as DISTRIBUTION
 
 if TYPE_CHECKING:
     from slam.commands.run.run import run_slam
+    from slam.config.sections import load_config
     from slam.pipeline.live import Slam
     from slam.results.folder import RunFolder
 
-__all__ = ["RunFolder", "Slam", "run_slam"]
-_HOMES = {"RunFolder": "slam.results.folder", "Slam": "slam.pipeline.live", "run_slam": "slam.commands.run.run"}
+__all__ = ["RunFolder", "Slam", "load_config", "run_slam"]
+_HOMES = {
+    "RunFolder": "slam.results.folder",
+    "Slam": "slam.pipeline.live",
+    "load_config": "slam.config.sections",
+    "run_slam": "slam.commands.run.run",
+}
 
 
 def __getattr__(name: str) -> Any:
     """Import the system on first use: ``import slam`` alone stays light."""
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'slam' has no attribute '{name}'")
+    raise AttributeError(f"module 'slam' has no attribute '{name}': it has {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

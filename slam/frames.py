@@ -1,6 +1,6 @@
 """Data types shared by the parts of the system: frozen records, two protocols, depth between pixels.
 
-The front end, the graph and the map never import each other; ``slam/pipeline/batch.py`` passes these between them.
+The front end, the graph and the map never import each other; ``slam/pipeline/run.py`` passes these between them.
 """
 
 from __future__ import annotations

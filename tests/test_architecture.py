@@ -118,6 +118,10 @@ def test_no_module_is_named_like_one_of_python_and_every_folder_is_a_package() -
     assert not list((ROOT / "tests").rglob("__init__.py"))
 
 
+def test_the_package_shows_its_doors_alone() -> None:
+    assert {name for name in dir(slam) if not name.startswith("__")} == {"RunFolder", "Slam", "load_config", "run_slam"}
+
+
 def test_both_packages_are_of_one_distribution_and_one_place() -> None:
     """Other distributions ship a package ``slam`` too; pip would merge them without a word."""
     assert erfsfm.DISTRIBUTION == slam.DISTRIBUTION == "erfsfm-slam"

@@ -15,8 +15,6 @@ Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import os
 import shlex
 import shutil
@@ -32,6 +30,7 @@ from benchmarking.metrics import rows
 from benchmarking.work import ROOT, measured, revision, simulate, workers
 from shared.command import one_line_errors, parser_of
 
+from erfsfm.common.table import csv_of
 from slam.runtime.storage.files import write_atomically
 
 
@@ -74,11 +73,8 @@ def main(words: Sequence[str] | None = None) -> None:
     with workers(options.jobs, options.scheduler) as spread:
         results = measured(jobs, spread)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
-    table = io.StringIO()
-    writer = csv.DictWriter(table, table_of_runs[0])
-    writer.writeheader()
-    writer.writerows(table_of_runs)
-    write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(table.getvalue().encode()))
+    content = csv_of(table_of_runs).encode()
+    write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(content))
     drives = [(path, "DRIVE") for name in ("drives", "folders") for path in getattr(options, name, ())]
     text = page.section(options.mode, _command(options), results, "several" if options.scheduler else str(options.jobs))
     roots = [(getattr(options, name, None), name.upper()) for name in _ROOTS]

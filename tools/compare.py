@@ -16,7 +16,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -28,15 +28,15 @@ from benchmarking import metrics as m
 from benchmarking.page import notes
 from benchmarking.plan import QUIET, WHOLE, BenchmarkSequence, Configuration, plan, slug
 from benchmarking.work import JobResult, job_result, perform, revision
-from shared.command import markdown, one_line_errors, parser_of
+from shared.command import one_line_errors, parser_of
 
-from slam.commands.batch.execution import why_ended
+from erfsfm.common.processes import why_ended
+from erfsfm.common.table import DASH, Table
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
-from slam.results.error_columns import DASH, written
 from slam.results.folder import RunFolder
+from slam.results.tables import written
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import known
 from slam.sequences.catalogue import open_sequence
 
 WITH_MAP = Configuration("map", QUIET)
@@ -168,9 +168,9 @@ def _write_recording(drive: BenchmarkSequence, features: int, folder: Path) -> N
 
 def page(pairs: Sequence[Pair], command: str, commit: str, remarks: Sequence[str] = ()) -> str:
     """The page of all recordings."""
-    accuracy = markdown(list(_ACCURACY), [[cell(pair) for cell in _ACCURACY.values()] for pair in pairs], numbers=8)
+    accuracy = _table(_ACCURACY, pairs, 8)
     first = list({pair.name: pair for pair in reversed(pairs)}.values())[::-1]
-    cost = markdown(list(_COST), [[cell(pair) for cell in _COST.values()] for pair in first], numbers=9)
+    cost = _table(_COST, first, 9)
     failed = "".join(f"\n- ORB-SLAM3 failed on {p.name}: {p.peer.reason}" for p in pairs if p.peer.reason)
     without, with_map = [p.without_map for p in first], [p.with_map for p in first]
     return _PAGE.format(
@@ -183,6 +183,11 @@ def page(pairs: Sequence[Pair], command: str, commit: str, remarks: Sequence[str
     )
 
 
+def _table(columns: Mapping[str, Callable[[Pair], str]], pairs: Sequence[Pair], numbers: int) -> str:
+    rows = [[cell(pair) for cell in columns.values()] for pair in pairs]
+    return Table(list(columns), rows, names=len(columns) - numbers).markdown()
+
+
 def _wrapped(text: str) -> str:
     return fill(text, 118, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
@@ -193,7 +198,7 @@ def _ate(estimate: Trajectory | None, reference: Trajectory | None, among: Traje
         return DASH
     if among is not None:
         estimate, _ = associate(estimate, among)
-    return written(known(trajectory_metrics(*associate(estimate, reference)).align.dof7.ate_rmse_m), 3)
+    return written(trajectory_metrics(*associate(estimate, reference)).align.dof7.ate_rmse_m, 3)
 
 
 def _ours(pair: Pair, name: str = "optimised") -> Trajectory | None:
@@ -210,11 +215,11 @@ def _metric(pair: Pair) -> str:
     result = pair.without_map
     if result.reason or not result.metrics.is_metric:
         return DASH
-    return written(known(result.metrics.trajectories.optimised.align.dof6.ate_rmse_m), 3)
+    return written(result.metrics.trajectories.optimised.align.dof6.ate_rmse_m, 3)
 
 
 def _peer_cpu(pair: Pair) -> str:
-    frames = known(pair.without_map.metrics.sequence.frames)
+    frames = pair.without_map.metrics.sequence.frames
     seconds = pair.peer.record.get("cpu_s")
     return f"{1e3 * seconds / frames:.1f}" if seconds and frames else DASH
 

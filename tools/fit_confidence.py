@@ -22,12 +22,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from shared.command import markdown, one_line_errors, parser_of
+from shared.command import one_line_errors, parser_of
 
+from erfsfm.common.table import Table
 from slam.frontend.agreement import CONFIDENCE, share_right
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
-from slam.runtime.storage.record import known
 
 RIGHT = 0.01  # of the path
 FOCAL = "focal"  # in the names of runs with a wrong focal length
@@ -52,9 +52,9 @@ def outcomes(runs: Path) -> Iterator[Outcome]:
     """Of the run folders in a folder that have a truth and metres."""
     for path in sorted(runs.iterdir()):
         metrics = RunFolder(path).metrics()
-        ate_m, length_m = known(metrics.trajectories.optimised.align.dof6.ate_rmse_m), known(metrics.sequence.length_m)
-        if ate_m is not None and length_m and metrics.is_metric and not known(metrics.tracking):
-            sigmas = max(known(each.sigmas) or 0.0 for each in known(metrics.agreement) or ())
+        ate_m, length_m = metrics.trajectories.optimised.align.dof6.ate_rmse_m, metrics.sequence.length_m
+        if ate_m is not None and length_m and metrics.is_metric and metrics.tracking.absent:
+            sigmas = max(each.sigmas or 0.0 for each in metrics.agreement or ())
             yield Outcome(path.name, sigmas, ate_m / length_m)
 
 
@@ -99,7 +99,8 @@ def main(words: Sequence[str] | None = None) -> None:
     }
     stated = np.array([share_right(each.sigmas, constants[each.drive]) for each in known_cameras])
     right = np.mean([each.error <= RIGHT for each in known_cameras])
-    print(markdown(("confidence by the other drives", "runs", "mean", "share right"), rows(known_cameras, stated), 3))
+    head = ("confidence by the other drives", "runs", "mean", "share right")
+    print(Table(head, list(rows(known_cameras, stated))).markdown())
     in_use = np.array([share_right(each.sigmas, CONFIDENCE) for each in known_cameras])
     scores = brier(known_cameras, stated), brier(known_cameras, in_use), right * (1 - right)
     print("Brier score {:.3f} by the other drives, {:.3f} as in use, {:.3f} of a constant".format(*scores))

@@ -21,7 +21,7 @@ from shared.pictures import STYLE, cast, draw_trajectories, trajectories_of
 from erfsfm.inference import DepthPosePredictor, colour_disparity
 from slam.frames import Sequence
 from slam.results.folder import RunFolder
-from slam.results.report.map_mesh import MapMesh, MapMeshFile
+from slam.results.report.map_view import MapMesh, thinned_mesh
 from slam.runtime.run_files import MAP_MESH
 from slam.sequences.catalogue import open_sequence
 
@@ -61,7 +61,7 @@ def seat(folder: RunFolder, sequence: Sequence, frame: int) -> NDArray[np.uint8]
     T_world_camera = trajectories_of(folder)["optimised"].T_world_camera[frame]
     u, v = np.meshgrid(np.arange(SEAT_PX[0]) - 0.5 * SEAT_PX[0], np.arange(SEAT_PX[1]) - 0.5 * SEAT_PX[1])
     rays = np.stack([u, v, np.full_like(u, SEAT_PX[1])], axis=-1) @ T_world_camera[:3, :3].T
-    below = cast(MapMeshFile(folder.require(MAP_MESH)).reduced(MOST_TRIANGLES), T_world_camera[:3, 3], rays)
+    below = cast(thinned_mesh(folder.require(MAP_MESH), MOST_TRIANGLES), T_world_camera[:3, 3], rays)
     image = sequence.frame(frame).image
     height = round(image.shape[0] * below.shape[1] / image.shape[1])
     above = cv2.resize(image, (below.shape[1], height), interpolation=cv2.INTER_AREA)
@@ -79,7 +79,7 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
         figure = Figure(figsize=(7.4, 5.6), layout="constrained")
         draw_trajectories(figure, trajectories, "m")
         left = _raster(figure, WIDTH_PX // 2)
-    right = above(MapMeshFile(folder.require(MAP_MESH)).reduced(MOST_TRIANGLES), WIDTH_PX - WIDTH_PX // 2)
+    right = above(thinned_mesh(folder.require(MAP_MESH), MOST_TRIANGLES), WIDTH_PX - WIDTH_PX // 2)
     height = max(left.shape[0], right.shape[0])
     bottom = np.concatenate([_padded(left, height), _padded(right, height)], axis=1)
     return np.concatenate([top, bottom], axis=0)

@@ -8,10 +8,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from shared.command import markdown, one_line_errors, parser_of
+from shared.command import one_line_errors, parser_of
 
 from erfsfm.checkpoint import Model, load_model, save_model
 from erfsfm.common.readers.frame_range import merge
+from erfsfm.common.table import table_of
 from erfsfm.model_record import FILES, SHIPPED
 
 LARGEST_MB = 20
@@ -97,10 +98,7 @@ def averaged(model: Model, other: Model) -> Model:
 
 def _table(path: Path | None, fallback: dict[str, float]) -> str:
     rows = json.loads(path.read_text()) if path else [fallback]
-    keys = list(rows[0])
-    return markdown(
-        keys, [[f"{row[k]:.4f}" if isinstance(row[k], float) else str(row[k]) for k in keys] for row in rows]
-    )
+    return table_of(rows).markdown()
 
 
 if __name__ == "__main__":

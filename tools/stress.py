@@ -19,18 +19,19 @@ from typing import get_args
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from shared.command import markdown, one_line_errors, parser_of
+from shared.command import one_line_errors, parser_of
 
+from erfsfm.common.table import Table
 from slam import run_slam
+from slam.formats.trajectory import Trajectory, write_kitti
 from slam.frames import Sequence as FrameSequence
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.record import known
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.hazards import Hazard
-from slam.simulation.kitti_layout import write_image, write_lines, write_poses
+from slam.simulation.kitti_layout import write_image, write_lines
 from slam.simulation.options import SimulationOptions
 
 Image = NDArray[np.uint8]
@@ -144,7 +145,7 @@ def run(drive: Drive, camera: FrameSequence, weights: str, place: Path, output: 
         write_image(place / "images" / f"{k:06d}.png", image)
     write_lines(place / "camera.yaml", [f"{key}: {value}" for key, value in lines.items()])
     write_lines(place / "times.txt", [f"{stamp:.6f}" for stamp in drive.stamps])
-    write_poses(place / "truth.txt", drive.T_world_camera)
+    write_kitti(place / "truth.txt", Trajectory(np.arange(len(drive.stamps), dtype=float), drive.T_world_camera))
     return run_slam(place, weights=weights, truth=place / "truth.txt", output=output, overrides=OVERRIDES)
 
 
@@ -155,13 +156,13 @@ def row(name: str, drive: Drive, camera: FrameSequence, weights: str, keep: Path
             metrics = run(drive, camera, weights, Path(place), (keep or Path(place)) / name).metrics()
         except SlamError as refusal:
             return [name, "-", "-", f"refused: {refusal}".replace(place, "ROOT")]
-    ate_m, length_m = known(metrics.trajectories.optimised.align.dof6.ate_rmse_m), known(metrics.sequence.length_m)
+    ate_m, length_m = metrics.trajectories.optimised.align.dof6.ate_rmse_m, metrics.sequence.length_m
     percent = 100 * ate_m / length_m if ate_m is not None and length_m else np.nan
-    worst = max(known(metrics.agreement) or [], key=lambda each: known(each.sigmas) or 0.0)
-    said = [f"{gap.first} to {gap.last}: {gap.reason}" for gap in metrics.sequence.bridged]
-    said += [f"a segment begins at {segment.first}" for segment in list(metrics.sequence.segments)[1:]]
-    said.append(f"{worst.source}, {known(worst.sigmas):.1f} sigmas")
-    return [name, f"{percent:.1f}", f"{known(metrics.confidence.run) or 0.0:.2f}", "; ".join(said)]
+    worst = max(metrics.agreement or [], key=lambda each: each.sigmas or 0.0)
+    said = [f"{gap.first} to {gap.last}: {gap.reason}" for gap in metrics.sequence.bridged or ()]
+    said += [f"a segment begins at {segment.first}" for segment in (metrics.sequence.segments or [])[1:]]
+    said.append(f"{worst.source}, {worst.sigmas:.1f} sigmas")
+    return [name, f"{percent:.1f}", f"{metrics.confidence.run or 0.0:.2f}", "; ".join(said)]
 
 
 @one_line_errors()
@@ -174,7 +175,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", help="A:B, of simulated worlds", default="840:846")
     parser.add_argument("--change", action="append", choices=list(CHANGES), help="default: every one; repeat")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--keep", type=Path, help="folder for the run folders, which fit_confidence.py reads")
+    parser.add_argument("--keep", type=Path, help="folder for the run folders")
     o = parser.parse_args(words)
     cameras: list[FrameSequence] = []
     if o.dataset is not None:
@@ -190,7 +191,7 @@ def main(words: Sequence[str] | None = None) -> None:
         for change in o.change or CHANGES:
             rows.append(row(f"{camera.name}, {change}", CHANGES[change](drive), camera, o.weights, o.keep))
             print(*rows[-1][:3], file=sys.stderr)
-    print(markdown(("drive", "error, % of the path", "confidence", "said"), rows))
+    print(Table(("drive", "error, % of the path", "confidence", "said"), rows, names=4).markdown())
 
 
 if __name__ == "__main__":

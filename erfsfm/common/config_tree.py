@@ -146,16 +146,11 @@ def _one_line(error: ValidationError, model: type[BaseModel], origin: str, overr
     origin = _origin(place, origin, overrides)
     if first["type"] == "extra_forbidden":
         return f"unknown key '{place}' in {origin}; {_nearest_key(place, known)}"
-    # pydantic appends the branch of a union, or the place inside a value; keys end where no such key is known
-    key = place
-    while key and key not in known:
-        key = key.rpartition(".")[0]
-    if first["type"] == "model_type":
-        return f"'{key or 'all of it'}' in {origin} is a section of keys; got {_shown(first['input'])}"
-    wanted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    if not key:
-        return f"{origin}: {wanted}"
-    return f"'{key}' in {origin} should be {wanted}; got {_shown(first['input'])}"
+    # pydantic appends the branch of a union, or the place inside a value
+    key = max((name for name in known if f"{place}.".startswith(f"{name}.")), key=len, default="")
+    is_section = first["type"] == "model_type"
+    wanted = "a section" if is_section else first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"'{key}' in {origin} should be {wanted}; got {_shown(first['input'])}" if key else f"{origin}: {wanted}"
 
 
 def _origin(place: str, origin: str, overrides: Sequence[str]) -> str:
@@ -169,12 +164,10 @@ def _origin(place: str, origin: str, overrides: Sequence[str]) -> str:
 
 def _nearest_key(key: str, known: Sequence[str]) -> str:
     section, _, last = key.rpartition(".")
-    siblings = {name.rpartition(".")[2]: name for name in known if name.rpartition(".")[0] == section}
-    others = {name.rpartition(".")[2]: name for name in reversed(known)}
-    for names, least_ratio in ((siblings, 0.6), (others, 0.8)):
-        nearest = difflib.get_close_matches(last, names, 1, least_ratio)
-        if nearest:
-            return f"did you mean '{names[nearest[0]]}'?"
+    siblings = [name for name in known if name.rpartition(".")[0] == section]
+    last_words = {name.rpartition(".")[2]: name for name in (*reversed(known), *siblings)}  # siblings first
+    if nearest := difflib.get_close_matches(last, last_words, 1, 0.7):
+        return f"did you mean '{last_words[nearest[0]]}'?"
     return f"known keys{f' of {section}' if section else ''}: {', '.join(siblings)}"
 
 

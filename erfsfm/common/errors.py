@@ -6,7 +6,6 @@ import re
 import traceback
 from pathlib import Path
 
-COUNTED = {"counted": True}  # ``extra`` of a warning whose number tells more than each of them
 _LONGEST = 700
 _LAST = 200
 _OF_WORKER = "Original Traceback (most recent call last)"

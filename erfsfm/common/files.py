@@ -1,14 +1,17 @@
-"""Files that appear whole or not at all, and are read up to a limit."""
+"""Files that appear whole or not at all, and are read up to a limit; folders that one process at a time writes to."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import re
 import threading
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
+
+from erfsfm.common.errors import BusyError
 
 MAX_TEXT_BYTES = 256 * 2**20  # a trajectory of a million frames
 MAX_IMAGE_BYTES = 2**30
@@ -62,7 +65,7 @@ def read_bytes(path: Path, most: int) -> bytes:
     """
     if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
         return content
-    raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
+    raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", str(path))
 
 
 def read_text(path: Path, encoding: str = "utf-8-sig", most: int = MAX_TEXT_BYTES) -> str:
@@ -85,3 +88,38 @@ def unfinished_name(path: Path) -> str | None:
 def _sync(path: Path) -> None:
     with path.open("r+b") as file:
         os.fsync(file.fileno())
+
+
+class FolderLock(ExitStack):
+    """Folders held until the end of a block, or of the process, however it ends; nothing is left in them."""
+
+    def take(self, folder: Path) -> None:
+        """Hold a folder, which is made; without effect where the file system has no locks, or no folder can be made.
+
+        Raises:
+            BusyError: another process holds it.
+        """
+        try:
+            self._lock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BusyError(
+                f"another process writes to {folder}: wait for its end, or choose another --output"
+            ) from error
+
+    def wait_for(self, folder: Path) -> None:
+        """Hold a folder as soon as no other process does; else as `take`."""
+        self._lock(folder, fcntl.LOCK_EX)
+
+    def _lock(self, folder: Path, how: int) -> None:
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+        if not folder.is_dir():
+            return
+        descriptor = os.open(folder, os.O_RDONLY)
+        self.callback(os.close, descriptor)
+        try:
+            fcntl.flock(descriptor, how)
+        except BlockingIOError:
+            raise
+        except OSError:  # no locks here
+            return

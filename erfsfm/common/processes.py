@@ -1,16 +1,25 @@
-"""Work spread over processes."""
+"""Work in other processes: spread over several of this program, or a run of the SLAM system."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from pathlib import Path
 
 from erfsfm.common.errors import TrainingError
 from erfsfm.common.threads import stay_single_threaded
+
+_POLL_S = 0.5
+_GIB = 2**30
+_MOST_SAID = 20_000  # bytes of its standard error that are searched for the reason
 
 
 @contextmanager
@@ -28,3 +37,74 @@ def processes(work: str) -> Iterator[ProcessPoolExecutor]:
             raise TrainingError(f"a process that {work} was killed: is there enough memory?") from error
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def slam_process(
+    arguments: Sequence[str],
+    folder: Path | None = None,
+    log: Path | None = None,
+    threads: int = 0,
+    memory_gib: float = 0.0,
+    program: Sequence[str] = ("slam",),
+) -> str:
+    """Run ``erfsfm-slam ARGUMENTS`` with this interpreter, and wait for its end; it ends with this process.
+
+    Args:
+        arguments: of the command line.
+        folder: from which its paths are seen.
+        log: file that its standard error is added to.
+        threads: of libraries; 0 as they like.
+        memory_gib: where it needs more, it is ended; 0 for no limit.
+        program: module that is run, with words before the arguments.
+
+    Returns:
+        Why it failed, in one line; empty where it did not.
+    """
+    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
+    with tempfile.TemporaryFile("w+b") if log is None else log.open("a+b") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-Pm", *program, *arguments],
+            cwd=folder,
+            env=os.environ | (limits if threads else {}),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+        )
+        try:
+            exceeded = _watch(process, memory_gib)
+        finally:
+            process.kill()
+            process.wait()
+        said.seek(max(said.seek(0, os.SEEK_END) - _MOST_SAID, 0))
+        return exceeded or why_ended(process.returncode, said.read().decode(errors="replace"))
+
+
+def why_ended(code: int, stderr: str) -> str:
+    """Why a process failed, in one line; empty where it did not."""
+    if code == 0:
+        return ""
+    if code < 0:
+        return f"killed by {signal.Signals(-code).name}"
+    lines = [line.removeprefix("erfsfm-slam: ").strip() for line in stderr.splitlines() if line.strip()]
+    return lines[-1] if lines else f"exit code {code}"
+
+
+def _watch(process: subprocess.Popen[bytes], memory_gib: float) -> str:
+    """Wait for a process; a reason where it used too much memory and is to be ended."""
+    while True:
+        try:
+            process.wait(_POLL_S)
+            return ""
+        except subprocess.TimeoutExpired:
+            used = _resident_bytes(process.pid) / _GIB if memory_gib else 0.0
+            if used > memory_gib:
+                return f"it used {used:.1f} GiB of memory, more than the {memory_gib:.1f} GiB of --memory"
+
+
+def _resident_bytes(pid: int) -> int:
+    """Resident memory of a process; 0 where it cannot be read."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -6,13 +6,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from threading import Event, Thread
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
 """Is told the stage of long work, how many of its items are done, and of how many; what follows a comma may change."""
-
-_EVERY_S = 10.0
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -33,50 +30,33 @@ def progress_bar() -> Iterator[Progress]:
 
 
 @contextmanager
-def progress_lines(write: Callable[[str], object], every_s: float = _EVERY_S) -> Iterator[Progress]:
-    """A line every ten seconds, also while one item takes longer: the stage, what is done, its rate, the time left."""
-    lines, over = _Lines(), Event()
+def progress_lines(write: Callable[[str], object], every_s: float = 10.0) -> Iterator[Progress]:
+    """A line every ten seconds: the stage, what is done, and the time left at the rate of the stage."""
+    began = said = time.monotonic()
+    name, before = "", 0
 
-    def speak() -> None:
-        while not over.wait(every_s):
-            if lines.stage:
-                write(lines.text(time.monotonic()))
+    def update(stage: str, done: int, total: int) -> None:
+        nonlocal began, said, name, before
+        now = time.monotonic()
+        if _name(stage) != name:
+            name, began, before = _name(stage), now, done
+        if now - said < every_s:
+            return
+        said, left = now, ""
+        if done > before:
+            left = f", {duration((total - done) * (now - began) / (done - before))} left"
+        write(f"{stage}: {done} of {total}{left}")
 
-    thread = Thread(target=speak, name="progress", daemon=True)
-    thread.start()
-    try:
-        yield lambda stage, done, total: lines.take(stage, done, total, time.monotonic())
-    finally:
-        over.set()
-        thread.join()
-
-
-def duration(seconds: int) -> str:
-    """A time in words, to two units at most."""
-    minutes, hours = seconds // 60, seconds // 3600
-    if hours >= 48:
-        return f"{hours / 24:.1f} days"
-    return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {seconds % 60} s"
+    yield update
 
 
-class _Lines:
-    def __init__(self) -> None:
-        self.stage = ""
-        self._done = self._total = self._before = 0
-        self._began_s = 0.0
-
-    def take(self, stage: str, done: int, total: int, now_s: float) -> None:
-        if _name(stage) != _name(self.stage):
-            self._before, self._began_s = done, now_s
-        self.stage, self._done, self._total = stage, done, total
-
-    def text(self, now_s: float) -> str:
-        spent_s, done = now_s - self._began_s, self._done - self._before
-        text = f"{self.stage}: {self._done} of {self._total}"
-        if done <= 0 or spent_s <= 0 or self._done >= self._total:
-            return f"{text} after {spent_s:.0f} s"
-        left_s = round((self._total - self._done) * spent_s / done)
-        return f"{text}, {done / spent_s:.2g} a second, {duration(left_s)} left"
+def duration(seconds: float) -> str:
+    """As minutes and seconds, from two hours on in hours, from two days on in days."""
+    if seconds >= 2 * 86400:
+        return f"{seconds / 86400:.1f} days"
+    if seconds >= 2 * 3600:
+        return f"{seconds / 3600:.1f} hours"
+    return f"{round(seconds) // 60} min {round(seconds) % 60} s"
 
 
 @contextmanager

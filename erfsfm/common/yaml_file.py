@@ -9,8 +9,9 @@ from typing import Any
 import yaml
 
 from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.files import read_text
 
-MAX_BYTES = 256 * 1024
+MAX_BYTES = 2**18
 
 
 class YamlError(ErfsfmError):
@@ -26,17 +27,13 @@ def read_yaml(path: Path) -> Any:
     if not path.is_file():
         raise YamlError(f"{path} is not there, or not a file")
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
+        return parse_yaml(read_text(path, "utf-8", MAX_BYTES))
     except OSError as error:
-        raise YamlError(f"{path} cannot be read: {error.strerror}") from error
-    if len(content) > MAX_BYTES:
-        raise YamlError(f"{path} is larger than {MAX_BYTES // 1024} KiB: it is not one of this project's YAML files")
-    try:
-        return parse_yaml(content.decode("utf-8"))
-    except (YamlError, UnicodeDecodeError) as error:
-        problem = "it is not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error
-        raise YamlError(f"{path} is not YAML: {problem}") from error
+        raise YamlError(f"{path} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise YamlError(f"{path} is not YAML: it is not UTF-8 text") from error
+    except YamlError as error:
+        raise YamlError(f"{path} is not YAML: {error}") from error
 
 
 def parse_yaml(text: str) -> Any:
@@ -48,13 +45,10 @@ def parse_yaml(text: str) -> Any:
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
-        problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        mark = getattr(error, "problem_mark", None)
-        raise YamlError(f"{problem} (line {mark.line + 1})" if mark else str(problem)) from error
-    except (ValueError, OverflowError) as error:  # a date or number of the right form that does not exist
-        raise YamlError(" ".join(str(error).split())) from error
-    except RecursionError as error:
-        raise YamlError("lists within lists without end") from error
+        problem, mark = getattr(error, "problem", None) or str(error), getattr(error, "problem_mark", None)
+        raise YamlError(f"{problem} (line {mark.line + 1})" if mark else problem) from error
+    except (ValueError, OverflowError, RecursionError) as error:  # a date or number that does not exist, endless lists
+        raise YamlError(str(error)) from error
 
 
 class _Loader(yaml.SafeLoader):
@@ -68,13 +62,11 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """As the parent class, refusing duplicate keys."""
-        seen: set[tuple[str, str]] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                continue
-            if (key.tag, key.value) in seen:
+        keys: set[tuple[str, str]] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if (key.tag, key.value) in keys:
                 raise yaml.MarkedYAMLError(problem=f"duplicate key '{key.value}'", problem_mark=key.start_mark)
-            seen.add((key.tag, key.value))
+            keys.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
 

@@ -70,4 +70,4 @@ class ImageCache:
 
     def image(self, recording: Recording, index: int) -> NDArray[np.uint8]:
         """One frame ``(H, W, 3)``, decoded at most once while it stays in the cache."""
-        return self._images.get((id(recording), index), lambda: recording.image(index, *self._size))
+        return self._images.get((*recording.key, index), lambda: recording.image(index, *self._size))

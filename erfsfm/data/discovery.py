@@ -145,7 +145,16 @@ def _own(root: Path) -> list[Recording]:
     images = [] if is_video else _images(home)
     if images:
         files = by_name(images)
-        return split_at_gaps(Recording(f"folder/{recording_name(home)}", files.paths, camera), files)
+        depth = tuple(home / "depth" / f"{path.stem}.png" for path in files.paths)
+        exact = all(path.is_file() for path in depth)  # as a depth camera measures it
+        height_m = read_camera_file(home / CAMERA_FILE).height_or(None) or INDOOR_HEIGHT_M
+        name = f"folder/{recording_name(home)}"
+        return split_at_gaps(
+            Recording(
+                name, files.paths, camera, depth=depth if exact else None, camera_height_m=height_m if exact else None
+            ),
+            files,
+        )
     videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
     return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
 

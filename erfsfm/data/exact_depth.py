@@ -7,36 +7,52 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from erfsfm.common.errors import DataError
 from erfsfm.config import DataConfig, ExperimentConfig
-from erfsfm.data.array_cache import ImageCache
+from erfsfm.data.array_cache import ArrayCache, ImageCache
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import single_image
 
-FARTHEST_M = 200.0  # what the simulator leaves unknown is sky
+FARTHEST_M = 200.0  # what the simulator leaves unknown is sky; of a depth camera it may be anywhere
 
 
 class ExactImages:
-    """Images drawn from simulated worlds, each world as often as the others."""
+    """Images drawn from recordings with exact depth, each recording by its chance."""
 
-    def __init__(self, recordings: Sequence[Recording], config: ExperimentConfig, cache: ImageCache) -> None:
-        self._recordings, self._config, self._cache = recordings, config, cache
+    def __init__(
+        self, recordings: Sequence[Recording], chances: NDArray[np.float64], config: ExperimentConfig, cache: ImageCache
+    ) -> None:
+        self._recordings, self._chances, self._config, self._cache = recordings, chances, config, cache
+        size = (config.network.height, config.network.width)
+        self._depth = ArrayCache(depth_mb(config.data), size, np.float16)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Tensor]:
         """A `single_image` of a random frame."""
-        recording = self._recordings[int(rng.integers(len(self._recordings)))]
+        recording = self._recordings[int(rng.choice(len(self._recordings), p=self._chances))]
         index = int(rng.integers(len(recording)))
-        network = self._config.network
-        depth_m, height_m = recording.true_depth(index), recording.camera_height_m
-        assert depth_m is not None and height_m is not None, "recordings are exact"
-        depth_m = cv2.resize(depth_m, (network.width, network.height), interpolation=cv2.INTER_NEAREST_EXACT)
+        network, height_m = self._config.network, recording.camera_height_m
+        assert height_m is not None, "recordings are exact"
+        depth_m = self._depth.get((*recording.key, index), lambda: self._shrunk(recording, index)).astype(np.float32)
         seen = depth_m > 0
-        most = height_m / np.where(seen, depth_m, FARTHEST_M)
+        beyond = height_m / FARTHEST_M if recording.name.startswith("simulated/") else np.inf
+        most = np.where(seen, height_m / np.where(seen, depth_m, 1), beyond)
         image = self._cache.image(recording, index)
         camera = recording.camera.resized(network.width, network.height, network.fidelity)
         return single_image(image, camera, [np.where(seen, most, 0), most], self._config, rng)
+
+    def _shrunk(self, recording: Recording, index: int) -> NDArray[np.float32]:
+        depth_m, network = recording.true_depth(index), self._config.network
+        assert depth_m is not None, "recordings are exact"
+        small = cv2.resize(depth_m, (network.width, network.height), interpolation=cv2.INTER_NEAREST_EXACT)
+        return np.asarray(small, np.float32)
+
+
+def depth_mb(config: DataConfig) -> int:
+    """The part of ``data.cache_mb`` for exact depth."""
+    return config.cache_mb // 5 if config.exact > 0 else 0
 
 
 def by_label(recordings: Sequence[Recording], config: DataConfig) -> tuple[list[Recording], list[Recording]]:

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
-from erfsfm.common.files import write_atomically
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
@@ -31,15 +30,16 @@ from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
 from erfsfm.labels.many_views import NEIGHBOURS, label
-from erfsfm.labels.refined_depth import in_camera_heights, refined_label
+from erfsfm.labels.refined_depth import in_camera_heights, refined_label, shrunk
 from erfsfm.labels.structure import TeacherStructure
 from erfsfm.mvs.flow import Grey, measure
 from erfsfm.mvs.neighbours import neighbours_around
 
-VERSION = 2
-# pixels of the images that are measured: finer flow is slower and no surer; twice the networks' width would shift
-# labels, sampled by nearest, by half a pixel
+VERSION = 3
+# pixels of the images that flow alone measures: finer flow is slower and no surer; twice the networks' width would
+# shift labels, sampled by nearest, by half a pixel
 LARGEST_WIDTH = 800
+FINER = 2  # learned depth is refined at this many times the labels' size, where images have as many pixels
 LEAST_NEIGHBOURS = 2
 _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
@@ -177,8 +177,9 @@ class DriveLabels:
         return label(_grey(image), [*around.values()], camera.K.astype(np.float64), self._motion(target, around))
 
     def _refined(self, target: int, learned: Learned) -> Bounds | None:
-        """Label of a frame at the labels' size, around its learned depth."""
-        camera = self.recording.camera.resized(self.size[1], self.size[0])
+        """Label of a frame at the labels' size, around its learned depth, which is refined in finer images."""
+        finer = FINER if self.recording.camera.width > 1.5 * self.size[1] else 1
+        camera = self.recording.camera.resized(finer * self.size[1], finer * self.size[0])
         image, around = self._image(target, camera), self._greys(self._around(target), camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
@@ -193,7 +194,7 @@ class DriveLabels:
         others = {n: known[n] for n in chosen if n in known}
         if not others:
             return None
-        return refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth)
+        return shrunk(*refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth), finer)
 
     def _around(self, target: int) -> list[int]:
         """Frames before and after."""
@@ -255,17 +256,17 @@ class ManyViewTeacher:
         self._size = size
         self._stride = stride if measures == "depth and poses" else 1
         self._labels = ArrayCache(cache_mb, (2, *size), np.float16)
-        self._drives: dict[int, DriveLabels] = {}
+        self._drives: dict[tuple[str, Path], DriveLabels] = {}
 
     def drive(self, recording: Recording) -> DriveLabels:
         """Where the labels of a recording are kept."""
-        known = self._drives.get(id(recording))
+        known = self._drives.get(recording.key)
         if known is None:
             if recording.labels is not None:
                 known = DriveLabels(recording, recording.labels, self._size, self._stride, True, recording.skipped)
             else:
                 known = DriveLabels(recording, self._folder / self._digest(recording), self._size, self._stride)
-            self._drives[id(recording)] = known
+            self._drives[recording.key] = known
         return known
 
     def structure(self, recording: Recording, first: int, sources: int) -> TeacherStructure:
@@ -273,7 +274,7 @@ class ManyViewTeacher:
         drive, target = self.drive(recording), first + sources // 2
         if self.measures == "poses":
             return motion_alone(drive.motion(first, sources), self._size)
-        least, most = self._labels.get((id(recording), target), lambda: np.stack(drive.label(target)))
+        least, most = self._labels.get((*recording.key, target), lambda: np.stack(drive.label(target)))
         return TeacherStructure(drive.motion(first, sources), least, most)
 
     def prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
@@ -301,8 +302,7 @@ class ManyViewTeacher:
                     f"{drive.folder} holds not all labels of many views that are wanted: prepare the data again with "
                     "this teacher and this size of the networks"
                 )
-        for done, drive in enumerate(without):
-            progress("teacher: poses", done, len(without))
+        for drive in without:
             drive.measure_poses(weights)
         if self.measures == "poses":
             return

@@ -60,6 +60,11 @@ class Recording:
         """The name with its frames, as the leak record writes it: ``kitti_odometry/00[0:250]``."""
         return f"{self.name}[{self.start}:{self.start + len(self)}]"
 
+    @property
+    def key(self) -> tuple[str, Path]:
+        """Its frames in any process, and where they are."""
+        return self.frames_name, self.images[0]
+
     def part(self, start: int, stop: int) -> Recording:
         """Frames ``start`` to ``stop - 1`` of this recording, counted from its own first."""
         return replace(

@@ -7,7 +7,7 @@ augmentation. A run resumed at step k therefore draws the same samples as an uni
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
-from erfsfm.data.exact_depth import ExactImages, by_label
+from erfsfm.data.exact_depth import ExactImages, by_label, depth_mb
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, depth_alone, single_image, training_sample
@@ -53,7 +53,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._rank = rank
-        images_mb = config.data.cache_mb - (0 if many_views is None else labels_mb(config.data))
+        images_mb = config.data.cache_mb - depth_mb(config.data) - (0 if many_views is None else labels_mb(config.data))
         self._cache = ImageCache(images_mb, config.network.height, config.network.width)
         self._reader = SnippetReader()
         self._structures = StructureCache(config.teacher.cache)
@@ -61,8 +61,12 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
         exact, self._measured = by_label(self.recordings, config.data)
-        self._exact = ExactImages(exact, config, self._cache) if exact else None
-        self._probabilities = chances(self._measured, length, config.data)
+        weights = config.data.weights
+        _require_known(self.recordings, weights)
+        windows = [len(recording) - length + 1 for recording in self._measured]
+        self._probabilities = chances(self._measured, windows, weights)
+        worlds = chances(exact, [1] * len(exact), weights)  # a long world is as good as a short one
+        self._exact = ExactImages(exact, worlds, config, self._cache) if exact else None
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
@@ -314,18 +318,24 @@ def _may_stop(recording: Recording) -> bool:
     return recording.name.startswith("kitti_raw/") and not recording.without_stops
 
 
-def chances(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:
-    """Chance of each recording: by its windows, then by the configured weight of its kind."""
-    windows: NDArray[np.float64] = np.array([len(r) - length + 1 for r in recordings], dtype=np.float64)
-    if not config.weights:
-        return np.asarray(windows / windows.sum())
-    total = np.zeros(len(recordings))
-    for prefix, weight in config.weights.items():
-        chosen = np.array([r.name.startswith(prefix) for r in recordings])
-        if not chosen.any():
+def _require_known(recordings: Sequence[Recording], weights: Mapping[str, float]) -> None:
+    """Refuse weights of nothing, and recordings without one."""
+    for prefix in weights:
+        if not any(recording.name.startswith(prefix) for recording in recordings):
             raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
-        total += np.where(chosen, weight * windows / windows[chosen].sum(), 0)
-    if not total.all():
-        name = recordings[int(np.argmin(total))].name
-        raise DataError(f"data.weights gives '{name}' no weight: name it there, or leave its data set out")
-    return np.asarray(total / total.sum())
+    for recording in recordings:
+        if weights and not recording.name.startswith(tuple(weights)):
+            raise DataError(
+                f"data.weights gives '{recording.name}' no weight: name it there, or leave its data set out"
+            )
+
+
+def chances(recordings: Sequence[Recording], sizes: Sequence[int], weights: Mapping[str, float]) -> NDArray[np.float64]:
+    """Chance of each recording: by its size among those of its prefix, and by the weight of the prefix."""
+    each = np.array(sizes, dtype=np.float64)
+    total = np.zeros(len(recordings)) if weights else each
+    for prefix, weight in weights.items():
+        chosen = np.array([recording.name.startswith(prefix) for recording in recordings], dtype=bool)
+        if chosen.any():
+            total += np.where(chosen, weight * each / each[chosen].sum(), 0)
+    return np.asarray(total / total.sum()) if len(recordings) else total

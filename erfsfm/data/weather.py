@@ -1,4 +1,4 @@
-"""Simulated weather on a snippet: exposure jumps, motion blur, rain; the geometry is unchanged."""
+"""Simulated weather on a snippet: exposure jumps, motion blur, rain, cast shadows; the geometry is unchanged."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ from erfsfm.data.augmentation import Images
 
 Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
 
-_EACH = 0.6  # chance of each of the three
+_EACH = 0.6  # chance of each
 _BLUR_SAMPLES = 6  # images averaged into a blurred one
 
 
 def weathered(images: Images, rng: np.random.Generator) -> Images:
-    """The same views under random weather; positions of pixels do not change.
+    """The same views under random weather; positions of pixels do not change. A single image may get cast shadows.
 
     Args:
         images: ``(H, W, 3)`` uint8 each, in time order.
         rng: of all random draws.
     """
-    exposure, blur, rain = rng.random(3) < _EACH
+    exposure, blur, rain, shadow = rng.random(4) < _EACH
     seen: Pictures = [np.asarray(image / 255, dtype=np.float32) for image in images]
+    if shadow and len(seen) == 1:  # those of a snippet would have to move with the road
+        seen = [_shadowed(seen[0], rng)]
     if blur:
         seen = _blurred(seen, rng)
     if exposure:
@@ -30,6 +32,26 @@ def weathered(images: Images, rng: np.random.Generator) -> Images:
     if rain:
         seen = _rained_on(seen, rng)
     return [np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in seen]
+
+
+def _shadowed(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Shadows with soft edges below the upper third: bands across the image, or the spots of leaves."""
+    height, width = image.shape[:2]
+    shade = np.zeros((height, width), np.float32)
+    if rng.random() < 0.5:
+        for _ in range(int(rng.integers(1, 4))):
+            ends = rng.uniform(0.35, 1.1, 2) * height
+            thickness = rng.uniform(0.02, 0.3, 2) * height
+            corners = [(0, ends[0]), (width, ends[1]), (width, ends[1] + thickness[1]), (0, ends[0] + thickness[0])]
+            cv2.fillConvexPoly(shade, np.rint(corners).astype(np.int32), 1.0)
+    else:
+        cells = (max(2, int(rng.integers(6, 24))), max(2, int(rng.integers(8, 32))))
+        spots = cv2.resize(rng.random(cells).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        shade[spots < rng.uniform(0.3, 0.6)] = 1
+        shade[: int(rng.uniform(0.35, 0.6) * height)] = 0
+    shade = cv2.GaussianBlur(shade, (0, 0), float(rng.uniform(0.5, 2.5)))[..., None]
+    dark = rng.uniform(0.15, 0.6) * np.array([1, 1, rng.uniform(1, 1.2)])  # the sky's light is bluer than the sun's
+    return np.asarray(image * (1 - shade * (1 - dark.astype(np.float32))), np.float32)
 
 
 def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 MINIMUM_DEPTH_M = 1e-3
 CAP_M = 80.0  # farther truth is not compared
-BLOCK = 5  # images of a block
 Crop = Literal["none", "garg"]
 Scaling = Literal["none", "median"]
 Clipping = Literal["after", "before"]
@@ -105,16 +104,16 @@ def _scale(guess: NDArray[np.float64], truth: NDArray[np.float64], scaling: Scal
     return 1.0 if scaling == "none" else float(scaling)
 
 
-def block_error(values: Sequence[float]) -> float | None:
-    """Standard error of the mean of values in the order of a drive; None for fewer than two blocks.
+def standard_error(values: Sequence[float]) -> float | None:
+    """Of the mean of independent values, such as one for each street; None for fewer than two."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
 
-    Neighbouring images show the same things and err alike, so blocks of five or more are compared, not images.
-    """
-    count = len(values) // BLOCK
-    if count < 2:
-        return None
-    blocks = [np.mean(block) for block in np.array_split(np.asarray(values, dtype=np.float64), count)]
-    return float(np.std(blocks, ddof=1) / np.sqrt(count))
+
+def mean_ratio(values: Sequence[float], to: Sequence[float]) -> tuple[float, float | None]:
+    """Geometric mean of the ratios of positive values, street by street, and its standard error over streets."""
+    logarithms = np.log(np.asarray(values) / np.asarray(to))
+    mean, spread = float(np.exp(logarithms.mean())), standard_error(logarithms.tolist())
+    return mean, None if spread is None else mean * spread
 
 
 def mean_errors(errors: list[DepthErrors]) -> DepthErrors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +16,14 @@ from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.evaluation.depth_metrics import BLOCK, CAP_M, DepthErrors, block_error, depth_errors, mean_errors
+from erfsfm.evaluation.depth_metrics import (
+    CAP_M,
+    DepthErrors,
+    depth_errors,
+    mean_errors,
+    mean_ratio,
+    standard_error,
+)
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
 from erfsfm.evaluation.streets import find_streets
 
@@ -42,41 +49,55 @@ class PoseDepthNetworks(Protocol):
 
 
 def depth_protocol(
-    networks: PoseDepthNetworks, roots: Sequence[Path], allow_leak: bool, progress: Progress = silent
+    networks: Mapping[str, PoseDepthNetworks], roots: Sequence[Path], allow_leak: bool, progress: Progress = silent
 ) -> list[dict[str, Any]]:
     """Median-scaled depth errors under 80 m on the streets of all roots, each of which counts alike.
 
+    Args:
+        networks: to evaluate, by the name of their rows.
+        roots: with true depth.
+        allow_leak: evaluate also streets that networks were trained on.
+        progress: told of the stage, what is done, and of how many.
+
     Returns:
-        One row for the networks, and, where depth is dense, one for the median depth map of a root, a baseline that
-        uses no image. Of several streets both are means, and a row for each street follows. ``abs_rel_se`` is the
-        standard error by `block_error`.
+        A row for each networks, and, where depth is dense, one for the median depth map of a root, a baseline that
+        uses no image. Of several streets these are means, ``abs_rel_se`` is the standard error over streets, and rows
+        for each street follow. ``ratio`` is ``abs_rel`` over that of the first networks on the same street, of
+        several streets the geometric mean, with its standard error over streets ``ratio_se``.
 
     Raises:
         DataError: no true depth under a root, or a leak that was not allowed.
     """
     streets = [street for root in roots for street in find_streets(root)]
-    leaks = [refuse_leak(networks, street.seen, allow_leak) for street in streets]
-    total = sum(len(street.frames) for street in streets)
-    each: dict[str, list[list[DepthErrors]]] = {"networks": [], _BASELINE: []}
-    done = 0
-    for street in streets:
-        errors: dict[str, list[DepthErrors]] = {"networks": [], _BASELINE: []}
+    leaks = {
+        name: [refuse_leak(each, street.seen, allow_leak) for street in streets] for name, each in networks.items()
+    }
+    total, done = sum(len(street.frames) for street in streets), 0
+    errors: dict[str, list[list[DepthErrors]]] = {name: [[] for _ in streets] for name in (*networks, _BASELINE)}
+    for place, street in enumerate(streets):
         for load in street.frames:
             progress("depth", done, total)
             image, truth = load()
-            for name, guess in (("networks", networks.depth(image)), (_BASELINE, street.typical)):
-                found = None if guess is None else depth_errors(guess, truth, CAP_M, street.crop)
-                if found is not None:
-                    errors[name].append(found)
+            guesses = {name: each.depth(image) for name, each in networks.items()}
+            if street.typical is not None:
+                guesses[_BASELINE] = street.typical
+            for name, guess in guesses.items():
+                error = depth_errors(guess, truth, CAP_M, street.crop)
+                if error is not None:
+                    errors[name][place].append(error)
             done += 1
-        if not errors["networks"]:
+        if not all(errors[name][place] for name in networks):
             raise DataError(f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with")
-        for name, found_all in errors.items():
-            each[name].append(found_all)
-    rows = [_depth_row(name, found, any(leaks)) for name, found in each.items() if all(found)]
-    if len(streets) > 1:
-        singles = zip(streets, each["networks"], leaks)
-        rows += [_depth_row("networks", [found], leak) | {"street": street.name} for street, found, leak in singles]
+    first = next(iter(networks))
+    rows = []
+    for name, compared in errors.items():
+        if all(compared):
+            before = None if name in (first, _BASELINE) else errors[first]
+            rows.append(_depth_row(name, compared, before) | {"leak": any(leaks.get(name, ()))})
+    for place, street in enumerate(streets if len(streets) > 1 else ()):
+        for name in networks:
+            row = _depth_row(name, [errors[name][place]], None if name == first else [errors[first][place]])
+            rows.append(row | {"leak": leaks[name][place], "street": street.name})
     return rows
 
 
@@ -159,19 +180,17 @@ def windows(networks: PoseDepthNetworks, recording: Recording) -> Iterator[list[
             yield list(images)
 
 
-def _depth_row(method: str, streets: list[list[DepthErrors]], leak: bool) -> dict[str, Any]:
-    """Means over streets of the means over their frames."""
-    mean = mean_errors([mean_errors(errors) for errors in streets]).as_dict()
+def _depth_row(method: str, streets: list[list[DepthErrors]], before: list[list[DepthErrors]] | None) -> dict[str, Any]:
+    """Means over streets of the means over their frames, and their ratio to those of other networks ``before``."""
+    means = [mean_errors(errors) for errors in streets]
+    abs_rel = [each.abs_rel for each in means]
+    row: dict[str, Any] = {"method": method, **mean_errors(means).as_dict(), "abs_rel_se": standard_error(abs_rel)}
+    if before is not None:
+        row["ratio"], row["ratio_se"] = mean_ratio(abs_rel, [mean_errors(errors).abs_rel for errors in before])
+    row |= {f"{key}_reason": "one street" for key in ("abs_rel_se", "ratio_se") if key in row and row[key] is None}
     scales = np.array([each.scale for errors in streets for each in errors])
-    parts = [block_error([each.abs_rel for each in errors]) for errors in streets]
-    known = [part for part in parts if part is not None]
-    row: dict[str, Any] = {"method": method, **mean, "abs_rel_se": None}
-    if len(known) == len(parts):
-        row["abs_rel_se"] = float(np.linalg.norm(known)) / len(parts)
-    else:
-        row["abs_rel_se_reason"] = f"a street has fewer than {2 * BLOCK} images"
     row["scale_spread"] = float(scales.std() / scales.mean())
-    return row | {"images": len(scales), "streets": len(streets), "leak": leak}
+    return row | {"images": len(scales), "streets": len(streets)}
 
 
 def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: bool) -> bool:

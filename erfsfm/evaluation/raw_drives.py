@@ -23,7 +23,7 @@ from erfsfm.common.readers.kitti_calibration import (
     CalibrationFile,
     FloatArray,
 )
-from erfsfm.common.readers.kitti_oxts import velocity
+from erfsfm.common.readers.kitti_sensors import velocity
 from erfsfm.config import Fidelity
 
 _FRAME = re.compile(

@@ -6,8 +6,6 @@ The networks' package does not import the SLAM system: what goes between them ar
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import TrainingError
+from erfsfm.common.processes import slam_process
 from erfsfm.common.readers.pinhole import Pinhole
 
 FPS = 10.0
@@ -50,14 +49,10 @@ def drive_poses(
             put_image(index, drive / f"{index:06d}")
         numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         (drive / "camera.yaml").write_text(yaml.safe_dump(numbers | {"fps": FPS, "camera_height_m": CAMERA_HEIGHT_M}))
-        command = [sys.executable, "-m", "slam", "run", "--dataset", str(drive), "--output", str(output)]
-        command += ["--weights", weights, "--device", "cpu", "--json"]
-        for setting in SETTINGS:
-            command += ["--set", setting]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0 or not (output / TRAJECTORY).is_file():
-            reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
-            raise TrainingError(f"the teacher's poses of {name} could not be found: {reason}")
+        words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights, "--device", "cpu"]
+        reason = slam_process([*words, *(word for setting in SETTINGS for word in ("--set", setting))])
+        if reason or not (output / TRAJECTORY).is_file():
+            raise TrainingError(f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}")
         rows = np.loadtxt(output / TRAJECTORY).reshape(-1, 3, 4)
         mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
     if mode != "camera-height":

@@ -57,6 +57,28 @@ def refined_label(
     return least.astype(np.float32), most.astype(np.float32)
 
 
+def shrunk(least: Array, most: Array, factor: int) -> tuple[Array, Array]:
+    """Bounds ``(H, W)`` of the inverse depth of images that are smaller by a whole factor.
+
+    A pixel stands for a block of pixels: the bounds are as far apart as theirs, in the geometric mean, and the further
+    the more these differ, which they do at edges of depth. Where a pixel of the block has no bound, it has none.
+    """
+    if factor == 1:
+        return least, most
+    height, width = (length // factor for length in least.shape)
+    both = (least > 0) & np.isfinite(most)
+    with np.errstate(divide="ignore"):
+        low, high, middle = (
+            values.reshape(height, factor, width, factor).swapaxes(1, 2).reshape(height, width, -1)
+            for values in (np.log(least), np.log(most), np.where(both, np.log(np.where(both, least * most, 1)) / 2, 0))
+        )
+    spread = np.ptp(middle, axis=-1) / 2
+    both = np.isfinite(low).all(-1) & np.isfinite(high).all(-1)
+    known_low = np.where(both, low.mean(-1) - spread, low.min(-1))
+    known_high = np.where(both, high.mean(-1) + spread, high.max(-1))
+    return np.exp(known_low).astype(np.float32), np.exp(known_high).astype(np.float32)
+
+
 def in_camera_heights(learned: Array, measured: MeasuredDepth) -> Array | None:
     """Inverse depth ``(H, W)`` of any unit scaled to what is measured without it; None where too little is."""
     known = measured.inverse_depth > MIN_SNR * measured.sigma

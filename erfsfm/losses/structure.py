@@ -50,7 +50,8 @@ def disagreement(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor
     """Mean Huber loss of log disparity, over pixels with a bound.
 
     Between both bounds it is the square of the distance from their middle, outside it is linear with slope 1: a pixel
-    is drawn to what was measured, the less the wider its bounds. One bound alone counts only where it is violated.
+    is drawn to what was measured, the less the wider its bounds. One bound alone counts only where it is violated: the
+    mean is not over the sky that is far enough.
     Far surfaces are few pixels beside near ones, so a pixel weighs by the square root of its depth.
 
     Args:
@@ -68,7 +69,8 @@ def disagreement(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor
     huber = torch.where(apart < half, apart.square() / (2 * half), apart - half / 2)
     one_sided = (least - scaled).clamp(min=0) * has_least + (scaled - most).clamp(min=0)
     nearest = torch.where(has_most, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
-    weight = torch.where(has_most | has_least, nearest.rsqrt(), 0)
+    counts = both | (one_sided.detach() > 0)
+    weight = torch.where(counts, nearest.rsqrt(), 0)
     mean: Tensor = (weight * torch.where(both, huber, one_sided)).sum() / weight.sum().clamp(min=1)
     return mean
 

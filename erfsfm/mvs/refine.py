@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.projection import Projection, halved
-from erfsfm.mvs.semi_global import Costs, smoothed
-from erfsfm.mvs.sweep import is_inside, lowest, sweep, warped
+from erfsfm.mvs.sweep import Costs, is_inside, lowest, smoothed, sweep, warped
 
 STEPS = 2
 WINDOW_PX = 5
@@ -28,15 +27,6 @@ INDEPENDENT_PIXELS = 3.0  # of a window: residuals of neighbouring pixels are co
 SIGMA_FLOOR = 0.03
 LEAST_FIT = 0.4  # mean weight of the neighbours below which no depth explains them: the guess stays
 LEAST_PRIOR_SIGMA = 0.15
-UNDER_ROAD = 1.25  # depth below the camera over the road's from which on nothing can be static
-
-
-@dataclass(frozen=True)
-class Road:
-    """Points X of the road fulfil ``normal . X = height`` in the camera; the unit of length is that of the depth."""
-
-    normal: NDArray[np.float64]
-    height: float
 
 
 @dataclass(frozen=True)
@@ -72,7 +62,7 @@ class Measurement:
         return (self.information > 1 / LEAST_PRIOR_SIGMA**2) & (self.fit >= LEAST_FIT)
 
 
-Decide = Callable[[Measurement, Road | None], RefinedDepth]
+Decide = Callable[[Measurement], RefinedDepth]
 
 
 def measure(
@@ -103,26 +93,6 @@ def measure(
         step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step
     return Measurement(target, depth, K, change, information, fit, costs, coarse)
-
-
-def by_rules(measurement: Measurement, road: Road | None) -> RefinedDepth:
-    """The measured depth, and the learned one where no depth explains the neighbours.
-
-    Args:
-        measurement: of an image.
-        road: below which nothing static is seen: what seems to lie there moves with the camera and keeps the prior.
-    """
-    depth, K = measurement.depth, measurement.K
-    measured = measurement.measured
-    change = np.where(measurement.fit < LEAST_FIT, np.float32(0), measurement.change)
-    if road is not None:
-        moving = _under_road(depth * np.exp(-change), K, road) & ~_under_road(depth, K, road)
-        moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        change[moving], measured[moving] = 0, False
-    prior_sigma = max(LEAST_PRIOR_SIGMA, 1.48 * float(np.median(np.abs(change[measured])))) if measured.any() else 1.0
-    known = np.where(measured, measurement.information, 0) + 1 / prior_sigma**2
-    sigma = np.sqrt(1 / known + SIGMA_FLOOR**2)
-    return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma.astype(np.float32), measured)
 
 
 def _enlarged(change: Array, target: Appearance) -> Array:
@@ -175,11 +145,3 @@ def _gauss_newton(
     step = np.clip(-products / (squares + damping), -LARGEST_STEP, LARGEST_STEP)
     information = INDEPENDENT_PIXELS * squares / variance * np.square(weights / len(views))
     return step, information, weights / np.maximum(seen, 1e-3)
-
-
-def _under_road(depth: Array, K: NDArray[np.floating], road: Road) -> NDArray[np.bool_]:
-    """Pixels ``(H, W)`` whose depth would put them clearly below the road."""
-    n_u, n_v, n_1 = road.normal @ np.linalg.inv(K)
-    height, width = depth.shape
-    u, v = np.arange(width), np.arange(height)[:, None]
-    return np.asarray((n_u * u + n_v * v + n_1) * depth > UNDER_ROAD * road.height)

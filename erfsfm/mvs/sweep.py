@@ -1,4 +1,7 @@
-"""Plane sweep around a learned depth (Collins 1996, Gallup et al. 2007): the cost of each change of the depth."""
+"""Plane sweep around a learned depth (Collins 1996, Gallup et al. 2007): the cost of each change of the depth.
+
+Costs are smoothed by semi-global matching (Hirschmüller 2008) along four directions, in integers.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ from numpy.typing import NDArray
 
 from erfsfm.mvs.appearance import Array
 from erfsfm.mvs.projection import Projection
-from erfsfm.mvs.semi_global import LARGEST_COST, UNIT, Costs
 
 # changes of the logarithm of inverse depth, denser near the guess; negative is farther
 CHANGES: Array = np.array([-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32)
@@ -19,6 +21,12 @@ WINDOW_PX = 5
 WEIGHT_UNSEEN = 0.5  # of the cost of the guess, in views
 COST_OF_CHANGE = 0.1  # a unit of log inverse depth
 _OUTSIDE = 1e3
+Costs = NDArray[np.int16]
+UNIT = 2048  # of costs: the sum over four paths stays below the largest integer
+LARGEST_COST = 2.9
+SMALL_STEP = 0.05  # penalty for a change of one sample between neighbouring pixels
+LARGE_STEP = 1.0  # for more, where the image is smooth
+EDGE_GREY_LEVELS = 8.0  # image step across which a large step costs 1/e of that
 
 
 def sweep(levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array) -> Costs:
@@ -79,3 +87,37 @@ def lowest(costs: Costs) -> Array:
     shift = np.clip((before - after) / (2 * np.maximum(before + after - 2 * at, 1)), -0.5, 0.5)
     position = np.where(best == middle, middle + shift, best)
     return np.asarray(np.interp(position, np.arange(len(costs)), CHANGES), np.float32)
+
+
+def smoothed(costs: Costs, grey: Array) -> Costs:
+    """Costs ``(C, h, w)`` that also count steps of the solution, which are cheap at edges of the image ``(h, w)``.
+
+    They are known up to a constant of each pixel.
+    """
+    by_row = _both_ways(costs.transpose(1, 0, 2), _penalties(grey))  # (h, C, w)
+    by_column = _both_ways(costs.transpose(2, 0, 1), _penalties(grey.T))  # (w, C, h)
+    return np.asarray(by_row.transpose(1, 0, 2) + by_column.transpose(1, 2, 0))
+
+
+def _penalties(grey: Array) -> Costs:
+    """Of a large step between each row and the one before, ``(h - 1, w)``."""
+    steps = np.abs(np.diff(grey, axis=0))
+    return np.asarray(UNIT * (SMALL_STEP + LARGE_STEP * np.exp(-steps / EDGE_GREY_LEVELS)), np.int16)
+
+
+def _both_ways(volume: Costs, penalties: Costs) -> Costs:
+    """Sum of path costs ``(h, C, w)`` downwards and upwards; both run in one loop."""
+    height, samples, width = volume.shape
+    padded = np.full((height, samples + 2, 2 * width), 4 * UNIT, np.int16)
+    down_up = padded[:, 1:-1]
+    down_up[..., :width], down_up[..., width:] = volume, volume[::-1]
+    down_up[0] -= down_up[0].min(axis=0)
+    path, small = np.empty_like(down_up[0]), np.int16(UNIT * SMALL_STEP)
+    for before, row, large in zip(padded, down_up[1:], np.hstack([penalties, penalties[::-1]])):
+        np.minimum(before[:-2], before[2:], out=path)
+        path += small
+        np.minimum(path, before[1:-1], out=path)
+        np.minimum(path, large, out=path)
+        row += path
+        row -= row.min(axis=0)
+    return np.asarray(down_up[..., :width] + down_up[::-1, :, width:])

@@ -1,22 +1,35 @@
-"""Networks run by ONNX Runtime: half of PyTorch's processor time on a CPU, and no PyTorch where the graph is kept."""
+"""Networks run by ONNX Runtime: half of PyTorch's processor time on a CPU, and no PyTorch where the graph is kept.
+
+Graphs are kept on disk: to make one takes PyTorch and a second of processor time, to read it neither.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
+import logging
+import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from onnxruntime import InferenceSession
 
+from erfsfm.common.files import read_bytes, write_atomically
 from erfsfm.common.onnx_session import open_session
-from erfsfm.networks.graph_folder import is_kept, keep, kept
 
 if TYPE_CHECKING:
     from torch import nn
 
 Array = NDArray[np.float32]
+_MOST_BYTES = 2**30
+_MOST_GRAPHS = 16
+_DIGEST_BYTES = 32
+logger = logging.getLogger(__name__)
 
 
 class OnnxGraph:
@@ -57,8 +70,7 @@ class OnnxGraph:
         graph = kept(key) if self._identity else None
         if graph is None:
             from erfsfm.networks.deformable import has_large_sampling
-            from erfsfm.networks.onnx_export import exported
-            from erfsfm.networks.torch_network import TorchNetwork, tensors
+            from erfsfm.networks.torch_network import TorchNetwork, exported, tensors
 
             network, example = self._network(), tensors(inputs)
             if has_large_sampling(network, *example):
@@ -77,3 +89,54 @@ def _run(session: InferenceSession, *inputs: Array | list[Array]) -> Array:
     names = [entry.name for entry in session.get_inputs()]
     output: Array = session.run(None, dict(zip(names, _flat(inputs), strict=True)))[0]
     return output
+
+
+def folder() -> Path:
+    """Beside torch's own downloads, so that ``TORCH_HOME`` and ``XDG_CACHE_HOME`` move it."""
+    caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.environ.get("TORCH_HOME") or Path(caches, "torch")).expanduser().with_name("erfsfm")
+
+
+def is_kept(made_from: str) -> bool:
+    """Whether there is a file of this graph."""
+    return _path(made_from).is_file()
+
+
+def kept(made_from: str) -> bytes | None:
+    """An ONNX file from the folder; None if it is not there or damaged.
+
+    Args:
+        made_from: all that the graph depends on, but torch and our code.
+    """
+    path = _path(made_from)
+    with suppress(OSError):
+        content = read_bytes(path, _MOST_BYTES)
+        digest, graph = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        if hashlib.sha256(graph).digest() == digest:
+            path.touch()
+            return graph
+    return None
+
+
+def keep(made_from: str, graph: bytes) -> None:
+    """Write an ONNX file and delete the least recently used ones. A folder that cannot be written costs time only."""
+    content = hashlib.sha256(graph).digest() + graph
+    try:
+        write_atomically(_path(made_from), lambda partial: partial.write_bytes(content), sync=False)
+        for old in sorted(folder().glob("*.onnx"), key=lambda file: file.stat().st_mtime)[:-_MOST_GRAPHS]:
+            old.unlink()
+    except OSError as error:
+        logger.info("the network's graph is not kept: %s", error)
+
+
+def _path(made_from: str) -> Path:
+    torch_version = importlib.metadata.version("torch")
+    return folder() / f"{hashlib.sha256(f'{made_from} {torch_version} {_code()}'.encode()).hexdigest()}.onnx"
+
+
+def _code() -> str:
+    """Digest of the files from which graphs are made: networks and their geometry."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for file in sorted([*package.glob("networks/*.py"), *package.glob("geometry/*.py")]):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()

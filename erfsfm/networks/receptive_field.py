@@ -7,7 +7,6 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from erfsfm.networks.blocks import Encoder, Layer
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.depth_net import DepthNet
-from erfsfm.networks.lite0_depth import Lite0DepthNet
+from erfsfm.networks.lite0 import Lite0DepthNet
 from erfsfm.networks.pose_net import PoseNet
 
 Network = DepthNet | PoseNet | Lite0DepthNet
@@ -114,8 +113,7 @@ def measured(
     network: Network,
     size: tuple[int, int] = (128, 416),
     pixel: tuple[int, int] | None = None,
-    offsets_px: float | Literal["learned"] = 0.0,
-    stages: int | None = None,
+    offsets_px: float = 0.0,
 ) -> MeasuredField:
     """Bounding box and coverage by input gradients, with constant positive weights and a white image.
 
@@ -126,8 +124,7 @@ def measured(
         size: image (height, width).
         pixel: (row, column) of the observed output; its map's centre if None.
         offsets_px: how far deformable taps are pushed outwards from the kernel's centre, along both
-            axes, in pixels of the layer's input; ``learned`` keeps the network's own offsets.
-        stages: observe the output of this many encoder stages, all if None.
+            axes, in pixels of the layer's input.
     """
     encoder = copy.deepcopy(network.encoder).double().eval()
     for module in encoder.modules():
@@ -143,7 +140,7 @@ def measured(
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
     image = torch.ones(1, network.input_channels, *size, dtype=torch.float64)
-    return field_of(encoder, image.to(next(encoder.parameters()).device), pixel, _ROUNDING, stages)
+    return field_of(encoder, image.to(next(encoder.parameters()).device), pixel, _ROUNDING)
 
 
 def effective(network: Network, image: Tensor, pixel: tuple[int, int] | None = None) -> MeasuredField:
@@ -167,7 +164,6 @@ def field_of(
     image: Tensor,
     pixel: tuple[int, int] | None = None,
     rounding: float = 0.0,
-    stages: int | None = None,
 ) -> MeasuredField:
     """Field of one pixel of an encoder's output, by input gradients of the sum of its channels.
 
@@ -178,10 +174,9 @@ def field_of(
         image: its input, ``(1, C, H, W)``.
         pixel: (row, column) of the observed output; its map's centre if None.
         rounding: ratio to the largest gradient up to which a gradient counts as zero.
-        stages: observe the output of this many stages, all if None.
     """
     image = image.detach().clone().requires_grad_()
-    output = encoder(image)[(stages or len(encoder.stages)) - 1]
+    output = encoder(image)[-1]
     map_size = (output.shape[2], output.shape[3])
     row, column = pixel or (map_size[0] // 2, map_size[1] // 2)
     if not (0 <= row < map_size[0] and 0 <= column < map_size[1]):
@@ -211,15 +206,13 @@ def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
     return int(counter.get_total_flops()) // 2
 
 
-def _set_offsets(encoder: Encoder, offsets_px: float | Literal["learned"]) -> set[nn.Module]:
+def _set_offsets(encoder: Encoder, offsets_px: float) -> set[nn.Module]:
     """Fix the offsets of all deformable layers; return the convolutions that predict them."""
     predictors: set[nn.Module] = set()
     for module in encoder.modules():
         if not isinstance(module, DeformableConv2d):
             continue
         predictors |= {module.offset, module.modulator}
-        if isinstance(offsets_px, str):
-            continue
         module.reset_offsets()
         side = module.kernel.kernel_size[0]
         outwards = torch.sign(torch.arange(side) - (side - 1) / 2) * offsets_px

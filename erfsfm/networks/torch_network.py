@@ -1,7 +1,10 @@
-"""Trained networks in PyTorch as functions of arrays."""
+"""Trained networks in PyTorch as functions of arrays, and as ONNX files."""
 
 from __future__ import annotations
 
+import io
+import threading
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,6 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 Array = NDArray[np.float32]
+OPSET = 17
+_exporter = threading.Lock()  # torch.onnx keeps its settings in global variables
 
 
 class TorchNetwork:
@@ -34,3 +39,40 @@ def tensors(inputs: Sequence[Array | list[Array]], device: str = "cpu") -> list[
         return torch.from_numpy(array).to(device)
 
     return [list(map(moved, given)) if isinstance(given, list) else moved(given) for given in inputs]
+
+
+@torch.inference_mode()
+def exported(
+    network: nn.Module,
+    example: Sequence[Tensor | list[Tensor]],
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    free: Sequence[int] = (),
+) -> bytes:
+    """An ONNX file of a network, for inputs of the example's shapes.
+
+    Args:
+        network: in evaluation mode.
+        example: its inputs.
+        inputs: their names, lists counted one by one.
+        outputs: names of its outputs.
+        free: axes of the named inputs whose size may differ from the example's.
+    """
+    # Sizes become constants, as intended. The filters are those of the whole process and stay: graphs are made in a
+    # thread, and `warnings.catch_warnings` is not safe there.
+    warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # type: ignore[attr-defined]
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"torch\.(jit|onnx)\b")
+    warnings.filterwarnings("ignore", module=r"torch\.onnx\b")
+    file = io.BytesIO()
+    with _exporter:
+        torch.onnx.export(
+            network,
+            tuple(example),
+            file,  # type: ignore[arg-type]  # in memory: no disk that may be full
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes={name: {axis: f"axis{axis}" for axis in free} for name in inputs or ()} if free else None,
+            opset_version=OPSET,
+            dynamo=False,  # the newer exporter needs onnxscript, and writes the same graph
+        )
+    return file.getvalue()

@@ -1,4 +1,4 @@
-"""Receptive fields of networks: theoretical, by gradients, and effective with trained weights."""
+"""Receptive fields of networks: theoretical, by gradients, and effective with trained weights; a street to see."""
 
 from __future__ import annotations
 
@@ -14,21 +14,18 @@ from torch import Tensor
 
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ConfigError
+from erfsfm.common.readers.kitti_calibration import CAMERA_HEIGHT_M
+from erfsfm.common.table import Table
 from erfsfm.config import Fidelity
 from erfsfm.networks.presets import PRESETS, build
-from erfsfm.networks.receptive_field import (
-    MeasuredField,
-    Network,
-    effective,
-    measured,
-    theoretical,
-    theoretical_corner,
-)
+from erfsfm.networks.receptive_field import MeasuredField, Network, effective, measured, theoretical, theoretical_corner
 
 # Supports do not depend on the width; effective fields of untrained networks hardly do.
 _PROBE_WIDTH = 0.1
 _UNTRAINED_WIDTH = 0.25
 HELD = 0.95
+_HALF_WIDTH_M = 7.0
+_FOCAL_SHARE = 0.58  # focal length over image width, as KITTI's
 
 
 @dataclass(frozen=True)
@@ -107,15 +104,16 @@ def measure_fields(
     return [_row(*which, snippet, offsets_px, learned, device) for which in wanted]
 
 
-def field_table(rows: Sequence[FieldRow]) -> str:
-    """The summaries of rows as text, a line each below a heading."""
-    lines = [f"{'network':32}{'theory':>9}{'columns x rows':>16}{'share':>8}{'all outputs':>13}{'95 % in':>9}  weights"]
+def field_table(rows: Sequence[FieldRow]) -> Table:
+    """The summaries of rows."""
+    texts = []
     for row in (row.summary() for row in rows):
         name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
+        ratios = (f"{row[key]:.1%}" for key in ("share", "share_of_all_outputs", "effective_share_95"))
         box = f"{row['columns']} x {row['rows']}"
-        ratios = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
-        lines.append(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{ratios}  {row['weights']}")
-    return "\n".join(lines)
+        texts.append([name, row["weights"], f"{row['theoretical_px']} px", box, *ratios])
+    head = ["network", "weights", "theory", "columns x rows", "share", "all outputs", "95 % in"]
+    return Table(head, texts, names=2)
 
 
 def _row(
@@ -172,3 +170,43 @@ def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Te
     images = np.stack([snippet[middle], *(snippet[i] for i in around)])
     stacked = torch.from_numpy(images).permute(0, 3, 1, 2)  # (1 + N, 3, H, W)
     return stacked.reshape(1, -1, *images.shape[1:3]).float() / 127.5 - 1
+
+
+def street_snippet(frames: int, height: int, width: int, step_m: float = 1.0) -> list[NDArray[np.uint8]]:
+    """Consecutive views of a straight drive, in time order.
+
+    Args:
+        frames: how many.
+        height: of each view, pixels.
+        width: of each view, pixels.
+        step_m: forward motion between views.
+
+    Returns:
+        Images ``(height, width, 3)`` uint8 RGB.
+    """
+    return [_view(height, width, k * step_m) for k in range(frames)]
+
+
+def _view(height: int, width: int, z_m: float) -> NDArray[np.uint8]:
+    v, u = np.mgrid[:height, :width]
+    ray_x = (u - (width - 1) / 2) / (_FOCAL_SHARE * width)
+    ray_y = (v - (height - 1) / 2) / (_FOCAL_SHARE * width)
+    to_road = CAMERA_HEIGHT_M / np.maximum(ray_y, 1e-6)  # z-depth in metres
+    to_wall = _HALF_WIDTH_M / np.maximum(np.abs(ray_x), 1e-6)
+    depth = np.minimum(to_road, to_wall)
+    x, y, z = ray_x * depth, ray_y * depth, z_m + depth
+    wall = to_wall < to_road
+    sky = wall & (y < -6 - 2 * np.sin(np.floor(z / 9) * 2.4))
+    lane = (np.abs(np.abs(x) - 2) < 0.12) & (np.mod(z, 6) < 3)
+    window = (np.mod(z, 3) < 1.2) & (np.mod(y, 2.5) < 1.3)
+    shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * _grain(np.where(wall, y, x), z)
+    shade = np.where(sky, 0.92, shade / (1 + depth / 300))
+    tint = np.where(sky[..., None], [0.85, 0.93, 1.0], np.where(wall[..., None], [1.0, 0.9, 0.8], [0.95, 0.97, 1.0]))
+    return np.asarray(np.rint(255 * np.clip(shade[..., None] * tint, 0, 1)), dtype=np.uint8)
+
+
+def _grain(across: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A texture in [-1, 1] fixed to the world."""
+    waves = [np.sin(a * across + b * along + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9), (3.3, 0.4))]
+    texture: NDArray[np.float64] = np.mean(waves, axis=0)
+    return texture

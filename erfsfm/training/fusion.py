@@ -22,7 +22,7 @@ from erfsfm.inference import DepthPosePredictor
 from erfsfm.mvs.evidence import CHANGE, CHANNELS, FULL_SIZE
 from erfsfm.mvs.fusion import FILE, STEP
 from erfsfm.networks.fusion_net import LEVELS, FusionNet
-from erfsfm.networks.onnx_export import exported
+from erfsfm.networks.torch_network import exported
 from erfsfm.training.fusion_samples import FusionSamples, Sample
 from erfsfm.training.precision import has_bfloat16
 

@@ -15,7 +15,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.weather import weathered
 from erfsfm.inference import DepthPosePredictor, depth_at
 from erfsfm.mvs.appearance import Appearance, Array
-from erfsfm.mvs.evidence import evidence
+from erfsfm.mvs.fusion import evidence
 from erfsfm.mvs.neighbours import BASELINES, neighbours
 from erfsfm.mvs.refine import measure
 

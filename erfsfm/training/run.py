@@ -26,8 +26,7 @@ from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import KINDS, load_model
 from erfsfm.common.errors import ConfigError, DataError
-from erfsfm.common.files import write_atomically
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination

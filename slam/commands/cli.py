@@ -1,82 +1,295 @@
-"""The command line ``erfsfm-slam``."""
+"""The command line ``erfsfm-slam``: every verb with its options."""
 
 from __future__ import annotations
 
+import json
 import logging
 import shlex
 import sys
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from erfsfm import __version__
 from erfsfm.common import command_line
 from erfsfm.common.progress import progress_bar
-from slam.commands.batch.cli import verbs as batch_verbs
-from slam.commands.calibration.cli import verbs as calibration_verbs
-from slam.commands.downloads.cli import verbs as download_verbs
-from slam.commands.evaluation import verbs as evaluation_verbs
-from slam.commands.exports.cli import verbs as export_verbs
-from slam.commands.live.cli import verbs as live_verbs
-from slam.commands.localisation.cli import verbs as localisation_verbs
-from slam.commands.options import Json, Seed, UnusedDevice, options_of
-from slam.commands.run.request import RunRequest
-from slam.runtime.errors import SlamError
-from slam.runtime.terminal import print_table
+from slam.runtime.errors import DownloadError, RunError, SlamError
 
 if TYPE_CHECKING:
-    from slam.results.metrics import Metrics
+    from slam.results.folder import RunFolder
 
-app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode=None,  # markup would remove <...> or [...] from the help
-    pretty_exceptions_enable=False,
-    help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
-)
+app = command_line.application("erfsfm-slam", "Monocular SLAM on learned depth and ego-motion, on a CPU.")
 
+Sequence = Annotated[
+    str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09; of a bag the image topic")
+]
+Camera = Annotated[Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view, degrees")]
+Frames = Annotated[str | None, typer.Option(help="A:B, half-open")]
+Weights = Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")]
+Config = Annotated[str | None, typer.Option(help="a YAML file or a shipped name")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")]
+Output = Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<name>")]
+Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where the networks run")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
+Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"erfsfm-slam {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _options_of_all_verbs(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
-    ] = False,
-) -> None:
-    pass
+# every verb that computes takes both; in one that draws nothing and runs no network they change nothing
+UnusedDevice = Annotated[Literal["auto", "cpu", "cuda"], typer.Option("--device", hidden=True)]
+UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 
 
 @app.command()
-@options_of(RunRequest)
-def run(request: RunRequest, as_json: Json = False) -> None:
+def run(
+    dataset: Annotated[
+        Path | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
+    ] = None,
+    sequence: Sequence = None,
+    camera: Camera = None,
+    weights: Weights = "default",
+    config: Config = None,
+    overrides: Overrides = None,
+    frames: Frames = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="true camera poses: KITTI (a row a frame) or TUM (by stamps)")
+    ] = None,
+    output: Output = None,
+    rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA")] = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    as_json: Json = False,
+) -> None:
     """Trajectory, map and report of a sequence. Without options: the embedded simulated street.
 
     Example: erfsfm-slam run --dataset KITTI --sequence 09
     """
+    from slam.commands.run.request import RunRequest
     from slam.commands.run.run import perform
 
     with progress_bar() as progress:
-        folder = perform(replace(request, progress=progress, command=shlex.join(["erfsfm-slam", *sys.argv[1:]])))
-    metrics = folder.metrics()
+        folder = perform(
+            RunRequest(
+                dataset=dataset,
+                sequence=sequence,
+                camera=camera,
+                weights=weights,
+                config=config,
+                overrides=overrides,
+                frames=frames,
+                truth=truth,
+                output=output,
+                rerun=rerun,
+                gps=gps,
+                seed=seed,
+                device=device,
+                progress=progress,
+                command=_command(),
+            )
+        )
     if as_json:
-        typer.echo(metrics.to_json())
+        typer.echo(folder.metrics().to_json())
+    else:
+        _print_run(folder)
+
+
+@app.command()
+def live(
+    dataset: Annotated[str, typer.Option(help="number of a camera, address of a stream, video, or folder")],
+    camera: Camera = None,
+    every_frame: Annotated[
+        bool, typer.Option("--every-frame", help="wait for each image of a folder or video; drop none")
+    ] = False,
+    output: Output = None,
+    view: Annotated[bool, typer.Option("--view", help="open the rerun viewer (extra)")] = False,
+    wait: Annotated[float, typer.Option(min=0.1, max=1e6, help="seconds without an image that end the stream")] = 10.0,
+    weights: Weights = "default",
+    config: Config = None,
+    overrides: Overrides = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Poses while frames arrive, one JSON line a frame. Ctrl-C, or the end of the stream, leaves a whole run folder.
+
+    Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
+    """
+    from slam.commands.live.run import LiveRequest, run_live, write_line
+
+    request = LiveRequest(
+        dataset=dataset,
+        camera=camera,
+        every_frame=every_frame,
+        output=output,
+        view=view,
+        wait=wait,
+        weights=weights,
+        config=config,
+        overrides=overrides,
+        seed=seed,
+        device=device,
+        command=_command(),
+    )
+    folder = run_live(request, partial(write_line, sys.stdout))
+    typer.echo(f"everything in {folder.path}", err=True)
+
+
+@app.command()
+def batch(
+    drives: Annotated[Path, typer.Argument(help="a manifest (CSV), or a data set")],
+    output: Annotated[Path, typer.Option(help="holds a run folder for each drive, and drives.csv")],
+    sequence: Annotated[
+        list[str] | None, typer.Option("--sequence", "-s", help="sequence of the data set; repeat")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="drives at a time on this machine")] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="address of a Dask scheduler in place of this machine")] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="threads of a drive; default: the cores of this machine by the workers")
+    ] = None,
+    memory: Annotated[float, typer.Option(min=0, help="GiB that a drive may use; 0: all (Linux)")] = 0.0,
+    weights: Annotated[str | None, typer.Option(help="as for run")] = None,
+    config: Config = None,
+    overrides: Overrides = None,
+    frames: Annotated[str | None, typer.Option(help="A:B of every drive")] = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Many drives at once, each in a process of its own. Started again, it runs what is not whole.
+
+    Example: erfsfm-slam batch drives.csv --workers 4 --output drives
+    """
+    from slam.commands.batch import CSV, drives_of, options_of_drives, run_drives, summary_table
+
+    if memory and not Path("/proc/self/statm").exists():
+        raise SlamError("--memory needs Linux: leave it out here")
+    options = options_of_drives(weights, config, overrides or [], frames, seed, device)
+    planned = drives_of(drives, sequence or ["all"], options)
+    with progress_bar() as progress:
+        outcomes = run_drives(planned, output, workers, scheduler, progress, threads, memory)
+    summary_table(outcomes).print()
+    failed = [outcome for outcome in outcomes if outcome.status == "failed"]
+    kept = sum(outcome.status == "kept" for outcome in outcomes)
+    typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {len(failed)} failed: {output / CSV}")
+    if failed:
+        rest = "; the others are whole" if len(failed) < len(outcomes) else ""
+        first = f"{failed[0].drive.name}: {failed[0].reason}"
+        raise RunError(f"{len(failed)} of {len(outcomes)} drives failed{rest}; {first}")
+
+
+@app.command()
+def evaluate(
+    paths: Annotated[
+        list[str], typer.Argument(help="ESTIMATE REFERENCE (files or a run), or runs; with --reference any of both")
+    ],
+    reference: Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B of the reference, half-open")] = None,
+    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the files")] = "auto",
+    csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
+    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
+    as_json: Json = False,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Errors of trajectories or of whole runs.
+
+    Of two trajectories, files or that of a run: all metrics under all alignments. Of run folders: their tables side by
+    side. With --reference: one table of any number of files and runs. NAME=PATH names a system; of several with one
+    NAME the table has mean and deviation.
+
+    Example: erfsfm-slam evaluate ours=results/latest "orb=orb_*.txt" --reference poses/09.txt
+    """
+    from slam.commands import evaluation
+
+    files, limits = [Path(path) for path in paths], fail_over or []
+    if reference is not None:
+        evaluation.against_reference(paths, reference, frames, format, limits, as_json, csv)
+    elif frames or csv:
+        raise typer.BadParameter("--frames and --csv need --reference FILE")
+    elif all(path.is_dir() for path in files):
+        if limits:
+            raise typer.BadParameter("a limit applies to trajectory files: give --reference", param_hint="--fail-over")
+        evaluation.of_runs(files, as_json)
+    elif len(files) == 2:
+        evaluation.of_two(files[0], files[1], format, limits, as_json)
+    else:
+        given = ", ".join(paths)
+        raise typer.BadParameter(f"give two trajectory files, run folders that exist, or --reference FILE; got {given}")
+
+
+@app.command()
+def export(
+    run: Annotated[Path, typer.Argument(help="a run folder")],
+    what: Annotated[str, typer.Option(help="mesh, cloud, colmap, nerfstudio or occupancy")],
+    output: Annotated[Path, typer.Option(help="the file to write; for colmap and nerfstudio a folder")],
+    up: Annotated[str, typer.Option(help="axes of the world: y-down (camera axes) or z")] = "y-down",
+    resolution: Annotated[float | None, typer.Option(help="side of a cell of an occupancy grid; default 0.1")] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="where the images of the run are now, for colmap and nerfstudio")
+    ] = None,
+    points: Annotated[int | None, typer.Option(help="at most so many points of a COLMAP model")] = None,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Parts of a run as files for other programs.
+
+    The mesh or the cloud as PLY, the run as a COLMAP model or as a nerfstudio scene (transforms.json and images), or
+    the map as an occupancy grid for ROS.
+
+    Example: erfsfm-slam export results/latest --what mesh --output map.ply --up z
+    """
+    from slam.commands.export import export as export_run
+    from slam.results.folder import RunFolder
+
+    folder = RunFolder.open(run)
+    with progress_bar() as progress:
+        written = export_run(
+            folder, what, output, up, resolution=resolution, dataset=dataset, points=points, progress=progress
+        )
+    typer.echo(f"{what} of {run} in {written}")
+    for note in folder.metrics().unit_notes():
+        typer.echo(note)
+
+
+@app.command()
+def localize(
+    images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
+    map: Annotated[Path, typer.Option("--map", help="a run folder")],
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml or fov=70; default: beside the images, else the run's")
+    ] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B of the images, half-open")] = None,
+    every: Annotated[int, typer.Option(min=1, help="every n-th of them")] = 1,
+    output: Annotated[
+        Path | None, typer.Option(help="poses found, as TUM with image numbers as stamps, or .kitti")
+    ] = None,
+    as_json: Json = False,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Poses of new images in an earlier run's map. They are in its frame and unit.
+
+    Example: erfsfm-slam localize photos --map results/latest --output photos.tum
+    """
+    from slam.commands.localisation import image_numbers, localisation_table, localise, write_localisations
+    from slam.results.folder import RunFolder
+    from slam.results.output_file import check_replaced_trajectory
+
+    run_folder = RunFolder.open(map)
+    if output is not None:
+        check_replaced_trajectory(output)
+    numbers = image_numbers(images, frames, every)
+    found = []
+    with progress_bar() as progress:
+        for localisation in localise(images, run_folder, camera, numbers):
+            found.append(localisation)
+            progress("images", len(found), len(numbers))
+    if output is not None:
+        write_localisations(output, found, numbers)
+    if as_json:
+        typer.echo(json.dumps([each.tree() for each in found], indent=2))
         return
-    _print_run(folder.path, metrics)
-
-
-app.add_typer(evaluation_verbs)
-app.add_typer(export_verbs)
-app.add_typer(batch_verbs)
-app.add_typer(live_verbs)
-app.add_typer(calibration_verbs)
-app.add_typer(download_verbs)
-app.add_typer(localisation_verbs)
+    localisation_table(found).print()
+    for note in run_folder.metrics().unit_notes():
+        typer.echo(note)
 
 
 @app.command()
@@ -100,7 +313,7 @@ def simulate(
     varied: Annotated[
         bool,
         typer.Option(
-            "--varied", help="another camera than KITTI's, railings, people, cars that overtake; of rooms another lens"
+            "--varied", help="any camera, hills, hard light, kinds of street, people, overtaking; of rooms another lens"
         ),
     ] = False,
     motion: Annotated[
@@ -113,14 +326,79 @@ def simulate(
 
     Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
     """
-    from slam.simulation.kitti_layout import write_kitti_root
+    from slam.simulation.kitti_layout import simulated_world, write_kitti_root
     from slam.simulation.options import parse_options
-    from slam.simulation.worlds import simulated_world
 
     world = simulated_world(parse_options(route, frames, seed, width, height, hazards, varied, motion, rate))
     with progress_bar() as progress:
         write_kitti_root(world, output, depth, lidar, lambda done: progress("frames", done, frames), mesh)
     typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")
+
+
+@app.command()
+def calibrate(
+    recording: Annotated[Path, typer.Argument(help="a video or a folder of images of the board")],
+    board: Annotated[str, typer.Option(help="corners between the squares: 9x6 for 10 by 7 squares")],
+    output: Annotated[Path, typer.Option(help="the camera.yaml to write")] = Path("camera.yaml"),
+    square_m: Annotated[float, typer.Option(min=1e-4, max=10.0, help="side of a square in metres")] = 0.03,
+    model: Annotated[Literal["opencv", "fisheye"], typer.Option(help="lens; fisheye beyond 110 degrees")] = "opencv",
+    pattern: Annotated[Literal["chessboard", "charuco"], typer.Option(help="pattern of the board")] = "chessboard",
+    dictionary: Annotated[str, typer.Option(help="OpenCV's dictionary of the ArUco markers")] = "5X5_100",
+    marker_share: Annotated[
+        float, typer.Option(min=0.1, max=0.99, help="side of a marker over that of a square")
+    ] = 0.75,
+    fps: Annotated[
+        float | None, typer.Option(min=1e-3, max=1e4, help="frame rate to write; default: the video's, or 10")
+    ] = None,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """A camera.yaml from images of a chessboard or a ChArUco board.
+
+    Images are chosen for spread and sharpness. The fit is drawn beside the output. Nothing is written where the images
+    do not determine the camera.
+
+    Example: erfsfm-slam calibrate board.mp4 --board 9x6 --square-m 0.03 --output camera.yaml
+    """
+    from slam.commands.board import Board, parse_board
+    from slam.commands.calibration import calibrate_camera
+
+    wanted = Board(*parse_board(board), square_m, pattern, dictionary, marker_share)
+    with progress_bar() as progress:
+        lines = calibrate_camera(recording, wanted, model, output, fps, progress)
+    for line in lines:
+        typer.echo(line)
+
+
+@app.command()
+def download(
+    data_set: Annotated[Literal["kitti-odometry"], typer.Argument(help="the data set")],
+    sequence: Annotated[str, typer.Option("--sequence", "-s", help="such as 09")],
+    to: Annotated[Path, typer.Option(help="folder that gets it")],
+    camera: Annotated[Literal["colour", "grey"], typer.Option(help="which images")] = "colour",
+    lidar: Annotated[bool, typer.Option("--lidar", help="scans as well")] = False,
+    accept_licence: Annotated[
+        bool, typer.Option("--accept-licence", help="you accept the licence that is shown")
+    ] = False,
+    mirror: Annotated[str | None, typer.Option(help="address of the archives, in place of the official one")] = None,
+) -> None:
+    """One sequence of KITTI odometry from its official server.
+
+    Of its archives only the files of the sequence are fetched. Run again, an interrupted download goes on.
+
+    Example: erfsfm-slam download kitti-odometry --sequence 09 --to KITTI
+    """
+    from slam.commands.download import LICENCE, SERVER, download_kitti
+
+    typer.echo(LICENCE)
+    if not accept_licence:
+        if not sys.stdin.isatty():
+            raise DownloadError("the licence above is to be accepted: give --accept-licence")
+        if not typer.confirm("Do you accept it?"):
+            raise DownloadError("the licence was not accepted: nothing is downloaded")
+    with progress_bar() as progress:
+        count = download_kitti(sequence, to, mirror or SERVER, camera == "grey", lidar, progress)
+    typer.echo(f"{count} files in {to}: erfsfm-slam run --dataset {to} --sequence {sequence}")
 
 
 @app.command()
@@ -137,9 +415,7 @@ def config() -> None:
 @app.command()
 def doctor(
     dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", "--calibration", help="camera.yaml of the data set, or fov=70")
-    ] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")] = None,
 ) -> None:
     """Check the installation. Missing parts come with what to do, and exit code 1.
 
@@ -155,35 +431,40 @@ def doctor(
         raise SlamError(f"{missing} of {len(lines)} parts are missing: do what their lines say")
 
 
-def _print_run(path: Path, metrics: Metrics) -> None:
-    from slam.results.error_columns import written
+def _print_run(folder: RunFolder) -> None:
+    """The errors of a run, what raises doubt, and where everything is."""
+    from slam.results.report.tables import by_reason
     from slam.results.report.verdict import verdict
-    from slam.results.terminal_tables import metrics_table
+    from slam.results.tables import errors_table, written
     from slam.runtime.run_files import REPORT
-    from slam.runtime.storage.record import Missing, known
 
+    metrics = folder.metrics()
     sequence, provenance, timing = metrics.sequence, metrics.provenance, metrics.timing
-    title = f"{known(sequence.name)}, scale {known(metrics.scale.mode)}"
-    if isinstance(sequence.length_m, Missing):
-        typer.echo(f"{title}: no errors, for {sequence.length_m.reason}")
+    title = f"{sequence.name}, scale {metrics.scale.mode}"
+    if sequence.length_m is None:
+        typer.echo(f"{title}: no errors, for {sequence.why('length_m')}")
     else:
-        print_table(metrics_table(metrics.evaluated_errors(), title))
-    if (sure := known(metrics.confidence.run)) is not None:
+        errors_table(metrics.evaluated_errors(), title).print()
+    if (sure := metrics.confidence.run) is not None:
         typer.echo(f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path")
     if (found := verdict(metrics)) is not None and found.doubts:
         typer.echo(f"doubts: {'; '.join(found.doubts)}")
     for note in metrics.unit_notes():
         typer.echo(note)
-    for gap in sequence.bridged:
-        typer.echo(f"INTERPOLATED: frames {gap.first} to {gap.last}: {gap.reason}")
-    depth = "" if provenance.depth_source == "network" else f"; depth {known(provenance.depth_source)}"
-    typer.echo(f"weights {known(provenance.weights)}: {known(provenance.weights_licence)}{depth}")
+    for line in by_reason(sequence.bridged or ()):
+        typer.echo(f"INTERPOLATED: {line}")
+    depth = "" if provenance.depth_source == "network" else f"; depth {provenance.depth_source}"
+    typer.echo(f"weights {provenance.weights}: {provenance.weights_licence}{depth}")
     seconds, per_second = written(timing.seconds_total, 1), written(timing.frames_per_second, 1)
-    report = path / REPORT
+    report = folder.path / REPORT
     typer.echo(
-        f"{known(sequence.frames) or 0} frames in {seconds} s ({per_second} a second); everything in {path}"
+        f"{sequence.frames or 0} frames in {seconds} s ({per_second} a second); everything in {folder.path}"
         + (f", read {report}" if report.is_file() else "")
     )
+
+
+def _command() -> str:
+    return shlex.join(["erfsfm-slam", *sys.argv[1:]])
 
 
 def main() -> None:

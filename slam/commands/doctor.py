@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import ctypes
 import importlib
 import os
 import platform
@@ -16,7 +14,7 @@ from erfsfm.inference import record_of_whole_weights
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
-from slam.sequences.truth import poses_beside
+from slam.sequences.poses import poses_beside
 
 IMPORTED = {
     "numpy": "numpy",
@@ -25,7 +23,7 @@ IMPORTED = {
     "opencv-python-headless": "cv2",
     "onnxruntime": "onnxruntime",
 }
-COMPARED = ("torch", "lightning", "evo")  # with the list of their files: to import them takes up to five seconds
+LOOKED_UP = ("torch", "lightning", "evo")  # to import them takes up to five seconds
 WEIGHTS = ("default", "sim", "erf-dfc", "erf-dfcv2")
 NO_DATA_SET = (
     f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset (the simulated street needs none)"  # no fault
@@ -40,7 +38,7 @@ def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
         camera: a ``camera.yaml`` in place of its own, or ``fov=DEGREES``.
     """
     lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
-    lines += [_package(name) for name in (*COMPARED, *IMPORTED)]
+    lines += [_package(name) for name in (*LOOKED_UP, *IMPORTED)]
     lines.append(_open3d())
     lines += [_weights(name) for name in WEIGHTS]
     variable = os.environ.get(KITTI_VARIABLE)
@@ -56,33 +54,12 @@ def _package(name: str) -> str:
     try:
         if name in IMPORTED:
             importlib.import_module(IMPORTED[name])
-        else:
-            _require_whole(name)
+        for needed in distribution(name).requires or ():
+            if ";" not in needed:  # without a condition
+                distribution(re.split(r"[^\w.-]", needed)[0])
         return f"ok       {name} {version(name)}"
     except (ImportError, OSError) as error:
         return f"missing  {name}: {error}; run make setup, or pip install --force-reinstall {name}"
-
-
-def _require_whole(name: str) -> None:
-    """Compare the files of a distribution with its list of them, and load PyTorch's library.
-
-    Raises:
-        ImportError: it, one of its files or what it needs is missing, or a file is damaged.
-        OSError: the library cannot be loaded.
-    """
-    found = distribution(name)
-    # not by ``files``: once importlib_metadata is imported, it leaves out those that are missing
-    for file, _, size in csv.reader((found.read_text("RECORD") or "").splitlines()):
-        path = Path(str(found.locate_file(file)))
-        if path.suffix == ".pyc" or not size:  # made after the installation
-            continue
-        if not path.is_file() or path.stat().st_size != int(size):
-            raise ImportError(f"its file {file} is missing or damaged")
-        if path.name.startswith("libtorch_python."):
-            ctypes.CDLL(str(path))
-    for needed in found.requires or ():
-        if ";" not in needed:  # without a condition
-            distribution(re.split(r"[^\w.-]", needed)[0])
 
 
 def _open3d() -> str:

@@ -1,77 +1,41 @@
-"""The verb ``evaluate`` of the command line."""
+"""Errors of trajectories or of whole runs, printed as a table or as JSON."""
 
 from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
 
 import typer
 
-from slam.commands.options import Json, UnusedDevice, UnusedSeed
+from slam.evaluation.mistakes import likely_mistakes
+from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
+from slam.formats.trajectory import associate
+from slam.results.folder import RunFolder
+from slam.results.output_file import check_replaced
+from slam.results.systems import compare, named_paths, systems_table, trajectory_at, write_csv
+from slam.results.tables import alignments_table, runs_json, runs_table
 from slam.runtime.errors import SlamError
-from slam.runtime.terminal import print_table
+from slam.runtime.run_files import REFERENCE
 
 logger = logging.getLogger(__name__)
-verbs = typer.Typer()
 
 
-@verbs.command()
-def evaluate(
-    paths: Annotated[
-        list[str], typer.Argument(help="ESTIMATE REFERENCE (files or a run), or runs; with --reference any of both")
-    ],
-    reference: Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")] = None,
-    frames: Annotated[str | None, typer.Option(help="A:B of the reference, half-open")] = None,
-    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the files")] = "auto",
-    csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
-    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
-    as_json: Json = False,
-    seed: UnusedSeed = 0,
-    device: UnusedDevice = "auto",
-) -> None:
-    """Errors of trajectories or of whole runs.
-
-    Of two trajectories, files or that of a run: all metrics under all alignments. Of run folders: their tables side by
-    side. With --reference: one table of any number of files and runs. NAME=PATH names a system; of several with one
-    NAME the table has mean and deviation.
-
-    Example: erfsfm-slam evaluate ours=results/latest "orb=orb_*.txt" --reference poses/09.txt
-    """
-    if reference is not None:
-        _compare(paths, reference, frames, format, fail_over or [], as_json, csv)
-        return
-    files = [Path(path) for path in paths]
-    if frames or csv:
-        raise typer.BadParameter("--frames and --csv need --reference FILE")
-    if all(path.is_dir() for path in files):
-        if fail_over:
-            raise typer.BadParameter("a limit applies to trajectory files: give --reference", param_hint="--fail-over")
-        _evaluate_runs(files, as_json)
-    elif len(paths) == 2:
-        missing = next((path for path in files if not path.exists()), None)
-        if missing is not None:
-            raise SlamError(f"{missing}: no such file or folder")
-        _evaluate_files(files[0], files[1], format, fail_over or [], as_json)
-    else:
-        given = ", ".join(paths)
-        raise typer.BadParameter(f"give two trajectory files, run folders that exist, or --reference FILE; got {given}")
-
-
-def _compare(
-    paths: list[str],
+def against_reference(
+    paths: Sequence[str],
     reference: Path,
     frames: str | None,
     format: str,
-    limits: list[str],
+    limits: Sequence[str],
     as_json: bool,
     csv: Path | None,
 ) -> None:
-    from slam.evaluation.trajectory import exceeded
-    from slam.results.output_file import check_replaced
-    from slam.results.systems import compare, named_paths, systems_table, write_csv
+    """Any number of trajectories against one truth, as a table of systems.
 
+    Raises:
+        SlamError: a file cannot be read or written, or an error is over its limit.
+    """
     if csv is not None:
         check_replaced(csv, {".csv": b"system,path"})
     runs = compare(named_paths(paths), reference, format, frames)
@@ -80,31 +44,32 @@ def _compare(
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:
-        print_table(systems_table(runs, reference))
-    broken = [f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)]
-    if broken:
-        raise SlamError("; ".join(broken))
+        systems_table(runs, reference).print()
+    _require([f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)])
 
 
-def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
-    from slam.results.folder import RunFolder
-    from slam.results.terminal_tables import comparison_json, comparison_table
+def of_runs(paths: Sequence[Path], as_json: bool) -> None:
+    """Run folders side by side.
 
+    Raises:
+        SlamError: one is none.
+    """
     runs = [RunFolder.open(path) for path in paths]
     if as_json:
-        typer.echo(json.dumps(comparison_json(runs), indent=2))
+        typer.echo(json.dumps(runs_json(runs), indent=2))
     else:
-        print_table(comparison_table(runs))
+        runs_table(runs).print()
 
 
-def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
-    from slam.evaluation.mistakes import likely_mistakes
-    from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
-    from slam.formats.trajectory import associate
-    from slam.results.systems import trajectory_at
-    from slam.results.terminal_tables import metrics_table
-    from slam.runtime.run_files import REFERENCE
+def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool) -> None:
+    """One trajectory against another under every alignment, with the commands of evo that give the same.
 
+    Raises:
+        SlamError: a file cannot be read, or an error is over its limit.
+    """
+    missing = next((path for path in (estimate, reference) if not path.exists()), None)
+    if missing is not None:
+        raise SlamError(f"{missing}: no such file or folder")
     whole = trajectory_at(estimate, format), trajectory_at(reference, format, REFERENCE)
     pair = associate(*whole)
     metrics = trajectory_metrics(*pair)
@@ -113,12 +78,14 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
     if as_json:
         typer.echo(metrics.to_json())
     else:
-        print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
+        alignments_table(metrics, f"{estimate.name} against {reference.name}").print()
         kind = "tum" if all(each.timed for each in whole) else "kitti"
         names = (estimate, "trajectory_optimised"), (reference, REFERENCE)
         ours, theirs = (path / f"{name}.{kind}.txt" if path.is_dir() else path for path, name in names)
-        for line in evo_commands(ours, theirs, format):
-            typer.echo(line)
-    broken = exceeded(metrics, limits)
+        typer.echo("\n".join(evo_commands(ours, theirs, format)))
+    _require(exceeded(metrics, limits))
+
+
+def _require(broken: Sequence[str]) -> None:
     if broken:
         raise SlamError("; ".join(broken))

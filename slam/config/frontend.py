@@ -39,21 +39,6 @@ class VisualOdometryConfig(Section):
         description="exponent on the local inlier ratio that weighs corners down on dynamic objects; 0: off",
     )
     min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
-    jitter_rotation_ratio: float = Field(
-        default=0.33, ge=0, description="rotation sigma over the rotation jitter of the camera"
-    )
-    jitter_direction_ratio: float = Field(
-        default=8.5, ge=0, description="sigma of the translation direction over the rotation jitter of the camera"
-    )
-    turn_rotation_ratio: float = Field(
-        default=0.007, ge=0, description="rotation sigma over the rotation angle of the step"
-    )
-    neighbour_rotation_ratio: float = Field(
-        default=0.25, ge=0, description="rotation sigma over the difference to the rotations of neighbouring steps"
-    )
-    neighbour_direction_ratio: float = Field(
-        default=1.0, ge=0, description="sigma of the translation direction over the difference to neighbouring steps"
-    )
 
 
 class RoadConfig(Section):
@@ -61,21 +46,6 @@ class RoadConfig(Section):
 
     enabled: bool = Field(
         default=True, description="measure steps by the homography of the ground plane, in camera heights"
-    )
-    near_heights: float = Field(
-        default=4.5,
-        gt=0,
-        description="far end of the short strip of road, used behind a vehicle ahead, in camera heights",
-    )
-
-
-class LengthConfig(Section):
-    """Joint estimation of all step lengths, see ``frontend/scale/step_lengths.py``. Sigmas are of logarithms."""
-
-    ratio_sigma: float = Field(default=0.004, gt=0, description="least sigma of the ratio of two consecutive steps")
-    learned_sigma: float = Field(default=0.1, gt=0, description="sigma of a length by learned depth")
-    outlier_sigmas: float = Field(
-        default=2.0, gt=0, description="residual at which the robust weight of a measurement is one half, sigmas"
     )
 
 
@@ -127,15 +97,6 @@ class ScaleConfig(Section):
     known_between: tuple[int | str, int | str] | None = Field(
         default=None, description="mode known: two frames of the run, or stamps in seconds such as 12.5s"
     )
-    road_top_ratio: float = Field(
-        default=0.35,
-        ge=0,
-        lt=1,
-        description="top edge of the road trapezoid, from horizon (0) to image bottom (1)",
-    )
-    road_bottom_ratio: float = Field(
-        default=0.97, gt=0, le=1, description="bottom edge of the road trapezoid, from horizon (0) to image bottom (1)"
-    )
 
     @field_validator("known_between")
     @classmethod
@@ -149,10 +110,4 @@ class ScaleConfig(Section):
     def _known_is_given(self) -> Self:
         if self.mode == "known" and (self.known_m is None or self.known_between is None):
             raise ValueError("known_m and known_between beside mode known")
-        return self
-
-    @model_validator(mode="after")
-    def _top_above_bottom(self) -> Self:
-        if self.road_top_ratio >= self.road_bottom_ratio:
-            raise ValueError("a road trapezoid with road_top_ratio < road_bottom_ratio")
         return self

@@ -5,26 +5,27 @@ A YAML file may leave keys out, which then have their defaults; ``configs/slam/d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+import erfsfm.common.errors
 from erfsfm.common.config_tree import Section
 from erfsfm.common.config_tree import dump_explained as dump_yaml
-from slam.config.files import load_sections
+from erfsfm.common.config_tree import load_config as load_tree
 from slam.config.frontend import (
     GapsConfig,
     GpsConfig,
     KeyframesConfig,
-    LengthConfig,
     LidarConfig,
     RoadConfig,
     ScaleConfig,
     ScaleMode,
     VisualOdometryConfig,
 )
+from slam.runtime.errors import ConfigError
 from slam.runtime.imports import plug_ins
 
 __all__ = [
@@ -32,12 +33,10 @@ __all__ = [
     "GapsConfig",
     "GpsConfig",
     "KeyframesConfig",
-    "LengthConfig",
     "LidarConfig",
     "LoopsConfig",
     "MappingConfig",
     "OutputConfig",
-    "PoseGraphConfig",
     "RoadConfig",
     "ScaleConfig",
     "ScaleMode",
@@ -47,7 +46,8 @@ __all__ = [
     "load_config",
 ]
 
-
+_HERE = Path(__file__).resolve().parents[1]
+_SHIPPED = (_HERE.parent / "configs" / "slam", _HERE / "_configs")  # in the source tree, in the wheel
 DEPTH_SOURCES = ("onnx", "npy", "png")
 DEPTH_PLUG_INS = "erfsfm_slam.depth"  # entry points of other packages: see docs/depth.md
 
@@ -85,10 +85,9 @@ class DepthConfig(Section):
     png_scale: float = Field(
         default=256.0, gt=0, description="png: value of a pixel at a depth of 1 m; a pixel of 0 is unknown"
     )
-    refine: Literal["none", "multiview", "learned"] = Field(
+    refine: Literal["none", "learned"] = Field(
         default="learned",
-        description="the keyframes' depth by neighbouring images at the optimised poses; multiview: by rules; learned: "
-        "a network fuses both",
+        description="the keyframes' depth by neighbouring images at the optimised poses; learned: a network fuses both",
     )
     fusion: str = Field(default="default", description="learned: default, or an output folder of erfsfm train-fusion")
 
@@ -136,14 +135,6 @@ class LoopsConfig(Section):
         description="largest difference of the translations measured in both directions, over the depth",
     )
     min_support: int = Field(default=2, ge=0, description="least number of images whose loops support a loop")
-
-
-class PoseGraphConfig(Section):
-    """The pose graph, see ``graph/pose_graph.py``."""
-
-    kernel: Literal["none", "huber"] = Field(default="huber", description="robust loss")
-    huber_k: float = Field(default=1.345, gt=0, description="whitened residual at which Huber becomes linear")
-    max_loop_residual: float = Field(default=8.0, gt=0, description="whitened residual beyond which a loop is removed")
 
 
 class MappingConfig(Section):
@@ -242,12 +233,10 @@ class SlamConfig(Section):
     keyframes: KeyframesConfig = KeyframesConfig()
     gaps: GapsConfig = GapsConfig()
     road: RoadConfig = RoadConfig()
-    lengths: LengthConfig = LengthConfig()
     lidar: LidarConfig = LidarConfig()
     gps: GpsConfig = GpsConfig()
     scale: ScaleConfig = ScaleConfig()
     loops: LoopsConfig = LoopsConfig()
-    pose_graph: PoseGraphConfig = PoseGraphConfig()
     mapping: MappingConfig = MappingConfig()
     output: OutputConfig = OutputConfig()
 
@@ -262,15 +251,21 @@ def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str]
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.
     """
-    return load_sections(SlamConfig, file_or_name, overrides)
+    return _load(file_or_name, overrides)
 
 
 def load_stored(path: Path, *sections: str) -> SlamConfig:
     """Sections of the configuration that a run has kept; the others, which are not read, have their defaults.
 
-    A run of an earlier release may have keys that are gone: they are left out.
-
-    Raises:
-        ConfigError: one line that names the key or file, what came and what is allowed.
+    A run of an earlier release may have keys that are gone: they are left out. Raises as `load_config`.
     """
-    return load_sections(SlamConfig, path, (), sections)
+    return _load(path, (), sections)
+
+
+def _load(
+    file_or_name: str | Path | None, overrides: Sequence[str], sections: Collection[str] | None = None
+) -> SlamConfig:
+    try:
+        return load_tree(SlamConfig, file_or_name, overrides, _SHIPPED, sections)
+    except erfsfm.common.errors.ConfigError as error:
+        raise ConfigError(str(error)) from error

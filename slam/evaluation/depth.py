@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record
+from slam.runtime.attempt import Failed
+from slam.runtime.storage.record import Count, Record
 
 LEAST_M, LARGEST_M = 1.0, 80.0
 COVERAGES = (50, 90, 95)
@@ -17,12 +18,12 @@ _MOST_FRAMES = 500  # held; of a longer drive every second frame, every fourth, 
 class DepthMetrics(Record):
     """The object D of ``metrics.json``; ``coverage`` is the share of errors inside so many per cent of the noise."""
 
-    abs_rel: Known[float] = MISSING
-    median_rel: Known[float] = MISSING
-    rmse_m: Known[float] = MISSING
-    a1: Known[float] = MISSING
-    coverage: Known[dict[str, float]] = MISSING
-    frames: Known[Count] = MISSING
+    abs_rel: float | None = None
+    median_rel: float | None = None
+    rmse_m: float | None = None
+    a1: float | None = None
+    coverage: dict[str, float] | None = None
+    frames: Count | None = None
 
 
 class DepthErrors:
@@ -73,11 +74,11 @@ class DepthErrors:
         depth, truth, sigma = np.concatenate(self._depths, axis=1).astype(np.float64)
         relative = np.abs(depth - truth) / truth
         ratio = np.maximum(depth / truth, truth / np.maximum(depth, 1e-9))
-        coverage: dict[str, float] | Missing = Missing("the network states no noise of its depth")
+        coverage: dict[str, float] | Failed = Failed("the network states no noise of its depth")
         if not np.isnan(sigma).any():
             errors = np.log(ratio) / sigma
             coverage = {str(level): float((errors < ndtri(0.5 + level / 200)).mean()) for level in COVERAGES}
-        return DepthMetrics(
+        return DepthMetrics.of(
             abs_rel=float(relative.mean()),
             median_rel=float(np.median(relative)),
             rmse_m=float(np.sqrt(np.square(depth - truth).mean())),

@@ -7,11 +7,12 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
@@ -31,7 +32,9 @@ from slam.evaluation.surface import (
 )
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
-from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record
+from slam.runtime.attempt import Failed
+from slam.runtime.imports import import_open3d
+from slam.runtime.storage.record import Count, Record, part
 
 NEAR_CAMERA_M = 20.0
 COVERED_WITHIN_M = 0.3
@@ -39,66 +42,59 @@ F_SCORES_M = {"0.2": 0.2, "0.5": 0.5}
 BINS_M = ((0.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
 OUTLIER_M = 1.0
 
+_WALL_NEAR_M, _WALL_FAR_M = 0.3, 2.0  # of the second surface in front of the first
+_PARALLEL = 0.7  # least cosine of the two normals
+_MOST_RAYS = 20_000  # of a piece
 _LEVER_M = 10.0  # distance from the camera at which an alignment counts rotations
 _LEAST_IN_BIN = 20
 _LEAF_POINTS = 32  # of the tree of true surface: less memory than with 16
 
-_NO_MAP = Missing("no map point lies within 25 m of a camera whose surroundings are known")
-_NO_SURFACE = Missing("no true surface is known at this distance from a camera")
-_FEW = Missing("too few points at this distance from a camera")
+_NO_MAP = Failed("no map point lies within 25 m of a camera whose surroundings are known")
+_NO_SURFACE = Failed("no true surface is known at this distance from a camera")
+_FEW = Failed("too few points at this distance from a camera")
 
 
 class Within(Record):
     """A share or score for two limits of distance in metres."""
 
-    m02: Known[float] = Field(default=MISSING, alias="0.2")
-    m05: Known[float] = Field(default=MISSING, alias="0.5")
+    m02: float | None = Field(default=None, alias="0.2")
+    m05: float | None = Field(default=None, alias="0.5")
 
 
 class SurfaceMetrics(Record):
-    """Errors of points of a map and of the true surface."""
+    """Errors of points of a map and of the true surface.
 
-    accuracy_median_m: Known[float] = MISSING
-    accuracy_90_m: Known[float] = MISSING
-    outlier_share: Known[float] = MISSING
-    completeness: Known[float] = MISSING
-    f_score: Known[Within] = MISSING
-    precision: Known[Within] = MISSING
-    recall: Known[Within] = MISSING
+    Of points that the truth's sensor could have seen, also their ``share``; of a ring around the nearest camera, its
+    ends and numbers of points.
+    """
 
-
-class _Share(Record):
-    share: Known[float] = MISSING
-
-
-class InField(SurfaceMetrics, _Share):
-    """Errors without points that the truth's sensor could not have seen, and the ``share`` of those that it could."""
-
-
-class _Bin(Record):
-    from_m: Known[float] = MISSING
-    to_m: Known[float] = MISSING
-    map_points: Known[Count] = MISSING
-    surface_points: Known[Count] = MISSING
-
-
-class Ring(SurfaceMetrics, _Bin):
-    """Errors between two distances from the nearest camera."""
+    accuracy_median_m: float | None = None
+    accuracy_90_m: float | None = None
+    outlier_share: float | None = None
+    completeness: float | None = None
+    f_score: Within = part(Within)
+    precision: Within = part(Within)
+    recall: Within = part(Within)
+    share: float | None = None
+    from_m: float | None = None
+    to_m: float | None = None
+    map_points: Count | None = None
+    surface_points: Count | None = None
 
 
 class PlacedMetrics(SurfaceMetrics):
-    """Errors of a map that was moved to the truth."""
+    """Errors of a map that was moved to the truth, by a motion with a ``scale`` or a rigid one."""
 
-    in_field: Known[InField] = MISSING
-    by_distance: Known[list[Ring]] = MISSING
-
-
-class _Scale(Record):
-    scale: Known[float] = MISSING
+    in_field: SurfaceMetrics = part(SurfaceMetrics)
+    by_distance: list[SurfaceMetrics] | None = None
+    scale: float | None = None
 
 
-class ScaledMetrics(PlacedMetrics, _Scale):
-    """Errors after a motion with a scale."""
+ERRORS = (
+    *("accuracy_median_m", "accuracy_90_m", "outlier_share", "completeness", "f_score", "precision", "recall"),
+    *("in_field", "by_distance"),
+)
+"""The values of every `PlacedMetrics`."""
 
 
 def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray, with_scale: bool = True) -> Similarity:
@@ -174,12 +170,12 @@ def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, 
     cameras = cKDTree(T_world_camera[:, :3, 3])
     nearest = {name: cameras.query(points, distance_upper_bound=RANGE_M) for name, points in maps.items()}
     found: dict[str, list[MapDistances]] = {name: [] for name in maps}
-    for part in parts:
-        near = nearby(T_world_camera, views, part)
-        to_surface, on_surface, surface_range = _surface_along(truth, near, T_world_camera, cameras, part)
+    for stretch in parts:
+        near = nearby(T_world_camera, views, stretch)
+        to_surface, on_surface, surface_range = _surface_along(truth, near, T_world_camera, cameras, stretch)
         for name, points in maps.items():
             away, camera = nearest[name]
-            own = _sampled(points, np.flatnonzero(np.isin(camera, part) & np.isfinite(away)))
+            own = _sampled(points, np.flatnonzero(np.isin(camera, stretch) & np.isfinite(away)))
             distances = to_surface(points[own]) if len(own) else np.empty(0)
             in_field, to_map = truth.in_field(points[own], near), _to_map(on_surface, points)
             found[name].append(MapDistances(distances, away[own], in_field, to_map, surface_range))
@@ -198,9 +194,9 @@ def placed_metrics(kind: type[_Placed], distances: MapDistances, **more: Any) ->
     for from_m, to_m in BINS_M:
         ring = distances.between(from_m, to_m)
         points = {"map_points": len(ring.to_surface), "surface_points": len(ring.to_map)}
-        curve.append(_metrics(Ring, ring, _LEAST_IN_BIN, from_m=from_m, to_m=to_m, **points))
+        curve.append(_metrics(SurfaceMetrics, ring, _LEAST_IN_BIN, from_m=from_m, to_m=to_m, **points))
     share = _share(whole.in_field) if len(whole.in_field) else _NO_MAP
-    in_field = _metrics(InField, whole.where_measured(), 1, share=share)
+    in_field = _metrics(SurfaceMetrics, whole.where_measured(), 1, share=share)
     return _metrics(kind, whole, 1, in_field=in_field, by_distance=curve, **more)
 
 
@@ -211,14 +207,14 @@ def _metrics(kind: type[_Kind], distances: MapDistances, least: int, **more: Any
     no_surface = (_NO_SURFACE if least == 1 else _FEW) if len(true) < least else None
     precision = {key: no_map or _share(own <= within) for key, within in F_SCORES_M.items()}
     recall = {key: no_surface or _share(true <= within) for key, within in F_SCORES_M.items()}
-    return kind(
+    return kind.of(
         accuracy_median_m=no_map or float(np.median(own)),
         accuracy_90_m=no_map or float(np.quantile(own, 0.9)),
         outlier_share=no_map or _share(own > OUTLIER_M),
         completeness=no_surface or _share(true <= COVERED_WITHIN_M),
-        f_score=Within(**{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}),
-        precision=Within(**precision),
-        recall=Within(**recall),
+        f_score=Within.of(**{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}),
+        precision=Within.of(**precision),
+        recall=Within.of(**recall),
         **more,
     )
 
@@ -227,10 +223,10 @@ def _share(which: Mask) -> float:
     return float(which.mean())
 
 
-def _harmonic_mean(precision: float | Missing, recall: float | Missing) -> float | Missing:
-    if isinstance(precision, Missing):
+def _harmonic_mean(precision: float | Failed, recall: float | Failed) -> float | Failed:
+    if isinstance(precision, Failed):
         return precision
-    if isinstance(recall, Missing):
+    if isinstance(recall, Failed):
         return recall
     return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
 
@@ -242,7 +238,7 @@ def _sampled(points: FloatArray, candidates: Indices) -> Indices:
 
 
 def _surface_along(
-    truth: SurfaceTruth, views: Indices, T_world_camera: FloatArray, cameras: cKDTree, part: Indices
+    truth: SurfaceTruth, views: Indices, T_world_camera: FloatArray, cameras: cKDTree, stretch: Indices
 ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray, FloatArray]:
     """The true surface around a stretch, from these views.
 
@@ -250,10 +246,10 @@ def _surface_along(
         distances ``(P,)`` of points ``(P, 3)`` to it, samples ``(S, 3)`` of what images show of it whose nearest camera
         is on the stretch, and that distance ``(S,)``.
     """
-    surface = accumulated(truth, views, T_world_camera[part, :3, 3])
+    surface = accumulated(truth, views, T_world_camera[stretch, :3, 3])
     samples = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]
     away, camera = cameras.query(samples, distance_upper_bound=RANGE_M)
-    own = np.flatnonzero(np.isfinite(away) & np.isin(camera, part))
+    own = np.flatnonzero(np.isfinite(away) & np.isin(camera, stretch))
     return truth.distance or _distance_to(surface.points), samples[own], away[own]
 
 
@@ -277,6 +273,39 @@ def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:
 
 def _together(parts: list[MapDistances]) -> MapDistances:
     def all_of(name: str) -> np.ndarray[Any, Any]:
-        return np.concatenate([getattr(part, name) for part in parts])
+        return np.concatenate([getattr(each, name) for each in parts])
 
     return MapDistances(*(all_of(each.name) for each in fields(MapDistances)))
+
+
+def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) -> float:
+    """Share of the area with a parallel surface 0.3 to 2 m before it; NaN without any area.
+
+    Args:
+        pieces: vertices ``(V, 3)`` and triangles ``(T, 3)``, whose normals look to where the camera was.
+    """
+    found = total = 0.0
+    for vertices, triangles in pieces:
+        corners = vertices[triangles]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        doubled_area = np.linalg.norm(normal, axis=1)
+        chosen = np.flatnonzero(doubled_area > 0)
+        chosen = chosen[:: -(-len(chosen) // _MOST_RAYS) or 1]
+        direction = normal[chosen] / doubled_area[chosen, None]
+        is_double = _has_parallel_before(vertices, triangles, corners[chosen].mean(axis=1), direction)
+        weight = doubled_area.sum() / max(doubled_area[chosen].sum(), np.finfo(float).tiny)
+        found += weight * float(doubled_area[chosen][is_double].sum())
+        total += float(doubled_area.sum())
+    return found / total if total > 0 else float("nan")
+
+
+def _has_parallel_before(
+    vertices: FloatArray, triangles: NDArray[np.int64], points: FloatArray, direction: FloatArray
+) -> NDArray[np.bool_]:
+    o3d = import_open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
+    rays = np.concatenate([points + _WALL_NEAR_M * direction, direction], axis=1).astype(np.float32)
+    answer = scene.cast_rays(o3d.core.Tensor(rays))
+    cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)
+    return np.asarray((answer["t_hit"].numpy() <= _WALL_FAR_M - _WALL_NEAR_M) & (cosine > _PARALLEL))

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from pydantic import Field
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
 from slam.evaluation.drift import KITTI_LENGTHS_M, relative_errors, segment_errors
@@ -27,8 +26,9 @@ from slam.formats.trajectory import (
 )
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import ConfigError, TrajectoryError
-from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record
+from slam.runtime.storage.record import Count, Record, part
 
 Alignment = Literal["none", "first", "scale", "6dof", "7dof"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
@@ -40,57 +40,57 @@ _SAME_ROTATION = 1e-9  # of the entries of a matrix
 _FEWEST_FRAMES: dict[Alignment, int] = {"none": 2, "first": 2, "scale": 3, "6dof": 3, "7dof": 3}
 _NO_REFERENCE = "there is no reference trajectory"
 _NOTHING_MOVES = "neither the estimate nor the reference moves, so there is no error to measure"
-_BACKWARDS = Missing("the best scale is negative: the estimate goes the other way")
+_BACKWARDS = Failed("the best scale is negative: the estimate goes the other way")
 _OPPOSITE = -0.9  # cosine between the positions of snippets
-_REFERENCE_STANDS_STILL = Missing("the reference does not move, so scaling would hide every error")
+_REFERENCE_STANDS_STILL = Failed("the reference does not move, so scaling would hide every error")
 
 
 class SnippetMetrics(Record):
     """Errors of snippets of five frames, mean and standard deviation, and their number."""
 
-    ate_mean: Known[float] = MISSING
-    ate_std: Known[float] = MISSING
-    re_mean: Known[float] = MISSING
-    re_std: Known[float] = MISSING
-    count: Known[Count] = MISSING
+    ate_mean: float | None = None
+    ate_std: float | None = None
+    re_mean: float | None = None
+    re_std: float | None = None
+    count: Count | None = None
 
 
 class AlignedMetrics(Record):
     """The object A of ``metrics.json``: errors under one alignment."""
 
-    ate_rmse_m: Known[float] = MISSING
-    t_rel_percent: Known[float] = MISSING
-    r_rel_deg_per_100m: Known[float] = MISSING
-    rpe_trans_m: Known[float] = MISSING
-    rpe_rot_deg: Known[float] = MISSING
-    scale: Known[float] = MISSING
+    ate_rmse_m: float | None = None
+    t_rel_percent: float | None = None
+    r_rel_deg_per_100m: float | None = None
+    rpe_trans_m: float | None = None
+    rpe_rot_deg: float | None = None
+    scale: float | None = None
 
 
 class Alignments(Record):
     """Errors by alignment."""
 
-    none: Known[AlignedMetrics] = MISSING
-    first: Known[AlignedMetrics] = MISSING
-    scale: Known[AlignedMetrics] = MISSING
-    dof6: Known[AlignedMetrics] = Field(default=MISSING, alias="6dof")
-    dof7: Known[AlignedMetrics] = Field(default=MISSING, alias="7dof")
+    none: AlignedMetrics = part(AlignedMetrics)
+    first: AlignedMetrics = part(AlignedMetrics)
+    scale: AlignedMetrics = part(AlignedMetrics)
+    dof6: AlignedMetrics = part(AlignedMetrics, "6dof")
+    dof7: AlignedMetrics = part(AlignedMetrics, "7dof")
 
 
 class EvoMetrics(Record):
     """Statistics under the alignment ``7dof`` by evo, and their largest difference from ours."""
 
-    ape_rmse_m_7dof: Known[float] = MISSING
-    rpe_trans_m: Known[float] = MISSING
-    rpe_rot_deg: Known[float] = MISSING
-    difference: Known[float] = MISSING
+    ape_rmse_m_7dof: float | None = None
+    rpe_trans_m: float | None = None
+    rpe_rot_deg: float | None = None
+    difference: float | None = None
 
 
 class TrajectoryMetrics(Record):
     """The object T of ``metrics.json``: all errors of a trajectory."""
 
-    snippet5: Known[SnippetMetrics] = MISSING
-    align: Known[Alignments] = MISSING
-    evo: Known[EvoMetrics] = MISSING
+    snippet5: SnippetMetrics = part(SnippetMetrics)
+    align: Alignments = part(Alignments)
+    evo: EvoMetrics = part(EvoMetrics)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Aligned:
 
     T_world_estimate: FloatArray
     T_world_reference: FloatArray
-    scale: float | Missing
+    scale: float | Failed
 
 
 def trajectory_metrics(
@@ -117,20 +117,20 @@ def trajectory_metrics(
     """
     reason = _why_not(estimate, reference)
     if reference is None or reason:
-        snippets = _snippet_metrics(snippet5) if snippet5 else SnippetMetrics.missing(reason)
-        aligned = Alignments(**dict.fromkeys(Alignments.model_fields, AlignedMetrics.missing(reason)))
-        return TrajectoryMetrics(snippet5=snippets, align=aligned, evo=EvoMetrics.missing(reason))
+        snippets = _snippet_metrics(snippet5) if snippet5 else SnippetMetrics.unknown(reason)
+        aligned = Alignments.of(**dict.fromkeys(ALIGNMENTS, AlignedMetrics.unknown(reason)))
+        return TrajectoryMetrics(snippet5=snippets, align=aligned, evo=EvoMetrics.unknown(reason))
     T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
     ours = {name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS}
     snippet5, is_cut = snippet5 or _cut_snippets(T_world_estimate, T_world_reference), snippet5 is None
-    snippets = _snippet_metrics(snippet5)
+    without_ate = None
     if snippet5 and _stands_still(T_world_reference):
-        snippets = snippets.model_copy(update=dict.fromkeys(("ate_mean", "ate_std"), _REFERENCE_STANDS_STILL))
+        without_ate = _REFERENCE_STANDS_STILL
     elif snippet5 and is_cut and _goes_backwards(T_world_estimate, T_world_reference):
-        snippets = snippets.model_copy(update=dict.fromkeys(("ate_mean", "ate_std"), _BACKWARDS))
+        without_ate = _BACKWARDS
     return TrajectoryMetrics(
-        snippet5=snippets,
-        align=Alignments.model_validate(ours),
+        snippet5=_snippet_metrics(snippet5, without_ate),
+        align=Alignments.of(**ours),
         evo=_evo_metrics(T_world_estimate, T_world_reference, ours["7dof"]),
     )
 
@@ -153,7 +153,7 @@ def align(T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment
         fit = se3.umeyama(g, p, with_scale=scaled and not still)
     elif scaled and not still:
         fit = se3.Similarity(float((g * p).sum() / (p * p).sum()), np.eye(3), np.zeros(3))
-    scale = Missing("the estimate does not move, so its scale is undefined") if scaled and still else fit.scale
+    scale = Failed("the estimate does not move, so its scale is undefined") if scaled and still else fit.scale
     return Aligned(fit.apply_to_poses(T_world_estimate), T_world_reference, scale)
 
 
@@ -189,7 +189,7 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: if a limit is malformed or there is no such metric.
     """
-    lines, names, tree = [], list(AlignedMetrics.model_fields), metrics.tree()
+    lines, names, tree = [], AlignedMetrics.names(), metrics.tree()
     for limit in limits:
         name, _, text = (part.strip() for part in limit.partition("="))
         try:
@@ -206,8 +206,8 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
                 f"align.{{{','.join(ALIGNMENTS)}}}.NAME, snippet5.NAME or evo.NAME"
             )
         record: Any = tree
-        for part in section.split("."):
-            record = record[part]
+        for name in section.split("."):
+            record = record[name]
         if record[key] is None:
             lines.append(f"{path} is not known ({record.get(f'{key}_reason')}), limit {most:g}")
         elif record[key] > most:
@@ -217,12 +217,8 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
 
 def _metric_paths() -> set[str]:
     """Every dotted path to a number of T."""
-    paths = {f"align.{name}.{key}" for name in ALIGNMENTS for key in AlignedMetrics.model_fields}
-    return (
-        paths
-        | {f"snippet5.{key}" for key in SnippetMetrics.model_fields}
-        | {f"evo.{key}" for key in EvoMetrics.model_fields}
-    )
+    paths = {f"align.{name}.{key}" for name in ALIGNMENTS for key in AlignedMetrics.names()}
+    return paths | {f"snippet5.{key}" for key in SnippetMetrics.names()} | {f"evo.{key}" for key in EvoMetrics.names()}
 
 
 def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
@@ -247,14 +243,14 @@ def _alignment_metrics(
     """The object A: errors of all rows after one alignment."""
     frames, fewest = len(T_world_estimate), _FEWEST_FRAMES[alignment]
     if frames < fewest:
-        return AlignedMetrics.missing(f"this alignment needs {fewest} frames; there are {frames}")
+        return AlignedMetrics.unknown(f"this alignment needs {fewest} frames; there are {frames}")
     if alignment in ("scale", "7dof") and _stands_still(T_world_reference):
-        return AlignedMetrics.missing(_REFERENCE_STANDS_STILL.reason)
+        return AlignedMetrics.unknown(_REFERENCE_STANDS_STILL.reason)
     aligned = align(T_world_estimate, T_world_reference, alignment)
-    if not isinstance(aligned.scale, Missing) and aligned.scale <= 0:
-        return AlignedMetrics.missing(_BACKWARDS.reason)
+    if not isinstance(aligned.scale, Failed) and aligned.scale <= 0:
+        return AlignedMetrics.unknown(_BACKWARDS.reason)
     offsets = aligned.T_world_estimate[:, :3, 3] - aligned.T_world_reference[:, :3, 3]
-    return AlignedMetrics(
+    return AlignedMetrics.of(
         ate_rmse_m=float(np.sqrt((offsets**2).sum(axis=1).mean())),
         **_segment_metrics(aligned.T_world_estimate, aligned.T_world_reference),
         **_step_metrics(aligned.T_world_estimate, aligned.T_world_reference),
@@ -262,12 +258,12 @@ def _alignment_metrics(
     )
 
 
-def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Missing]:
+def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Failed]:
     """KITTI's drift: the mean over all segments of 100 to 800 m of true path."""
     segments = segment_errors(T_world_estimate, T_world_reference, KITTI_LENGTHS_M)
     if not segments:
         path_m = se3.path_distance(T_world_reference)[-1]
-        none = Missing(f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m")
+        none = Failed(f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m")
         return {"t_rel_percent": none, "r_rel_deg_per_100m": none}
     translation = np.concatenate([each.translation_m / each.length_m for each in segments])
     rotation = np.concatenate([each.rotation / each.length_m for each in segments])
@@ -277,11 +273,11 @@ def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray
     }
 
 
-def _step_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Missing]:
+def _step_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Failed]:
     """Mean error from each frame to the next."""
     first = np.arange(len(T_world_estimate) - 1)
     if not first.size:
-        return dict.fromkeys(("rpe_trans_m", "rpe_rot_deg"), Missing("a single frame makes no step"))
+        return dict.fromkeys(("rpe_trans_m", "rpe_rot_deg"), Failed("a single frame makes no step"))
     translation, rotation = relative_errors(T_world_estimate, T_world_reference, first, first + 1)
     return {"rpe_trans_m": float(translation.mean()), "rpe_rot_deg": float(np.rad2deg(rotation).mean())}
 
@@ -301,23 +297,25 @@ def _goes_backwards(T_world_estimate: FloatArray, T_world_reference: FloatArray)
     return bool((g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()))
 
 
-def _snippet_metrics(errors: SnippetErrors | None) -> SnippetMetrics:
+def _snippet_metrics(errors: SnippetErrors | None, without_ate: Failed | None = None) -> SnippetMetrics:
     if errors is None:
-        few = Missing(f"a snippet needs {SNIPPET_LENGTH} frames")
-        return SnippetMetrics(ate_mean=few, ate_std=few, re_mean=few, re_std=few, count=0)
-    return SnippetMetrics.model_validate(asdict(errors))
+        few = Failed(f"a snippet needs {SNIPPET_LENGTH} frames")
+        found: dict[str, Any] = dict.fromkeys(("ate_mean", "ate_std", "re_mean", "re_std"), few) | {"count": 0}
+    else:
+        found = asdict(errors) | dict.fromkeys(("ate_mean", "ate_std") if without_ate else (), without_ate)
+    return SnippetMetrics.of(**found)
 
 
 def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ours: AlignedMetrics) -> EvoMetrics:
     """The statistics of ``7dof`` again, computed by evo alone, and the largest disagreement with ours."""
-    if isinstance(ours.ate_rmse_m, Missing):
-        return EvoMetrics.missing(ours.ate_rmse_m.reason)
+    if ours.ate_rmse_m is None:
+        return EvoMetrics.unknown(ours.why("ate_rmse_m"))
     try:
         from evo import EvoException
         from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
         from evo.core.trajectory import PosePath3D
     except ImportError as error:
-        return EvoMetrics.missing(f"evo cannot be imported ({error})")
+        return EvoMetrics.unknown(f"evo cannot be imported ({error})")
     estimate, reference = PosePath3D(poses_se3=[*T_world_estimate]), PosePath3D(poses_se3=[*T_world_reference])
     values = {}
     try:
@@ -330,10 +328,10 @@ def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ou
             metric.process_data((reference, estimate))
             values[key] = float(metric.get_statistic(statistic))
     except EvoException as error:
-        return EvoMetrics.missing(f"evo fails: {error}")
+        return EvoMetrics.unknown(f"evo fails: {error}")
     pairs = zip(values.values(), (ours.ate_rmse_m, ours.rpe_trans_m, ours.rpe_rot_deg))
-    differences = [abs(theirs - mine) for theirs, mine in pairs if not isinstance(mine, Missing)]
-    return EvoMetrics(**values, difference=max(differences))
+    differences = [abs(theirs - mine) for theirs, mine in pairs if mine is not None]
+    return EvoMetrics.of(**values, difference=max(differences))
 
 
 def _stands_still(T_world_camera: FloatArray) -> bool:

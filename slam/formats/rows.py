@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from bisect import bisect_left
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,16 @@ from slam.runtime.errors import SlamError
 logger = logging.getLogger(__name__)
 
 _LEAST_IN_ORDER = 0.75  # share of the rows; with fewer, nobody knows which of them are out of order
+_MOST_PLACES_LATE = 5
+_FRACTIONS = {13: 3, 16: 6}  # digits of milli- and microseconds since 1970, and how many are behind the point
+_NANOSECOND_DIGITS = 15  # at least
 
 
 class BadRows:
     """The rows of one file that are left out, with a reason each, and the rule for all tables.
 
-    A row that cannot be read, or whose stamp does not follow those of its neighbours, is left out. One warning counts
-    them and names the first. The file is refused where nothing is left, or where the order is ambiguous.
+    A row that cannot be read, or whose stamp repeats another's or is far from its place, is left out. One warning
+    counts them and names the first. The file is refused where nothing is left, or where the order is ambiguous.
     """
 
     def __init__(self, path: Path | str, error: type[SlamError]) -> None:
@@ -44,28 +46,36 @@ class BadRows:
             self.add(line, reason)
         return tuple(column[good] for column in (lines, *columns))
 
-    def in_order(self, stamps: NDArray[np.float64], what: str, lines: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """The rows ``(N,)`` of the longest series of increasing stamps ``(N,)``; the first of repeated ones.
+    def in_order(self, stamps: NDArray[np.float64], what: str, lines: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The rows in the order of their stamps ``(N,)``, without repeated ones and those far from their place.
+
+        A row a few places late is sorted in, and so are all rows of a table in no order at all.
 
         Raises:
             SlamError: more than a quarter of the rows would be left out.
         """
-        if not len(stamps):
-            return np.zeros(0, dtype=bool)
-        good = increasing(stamps.tolist())
-        for line in lines[~good].tolist():
+        order = np.argsort(stamps, kind="stable")
+        has_no_order = len(order) > 1 and np.mean(np.diff(stamps) < 0) > 1 - _LEAST_IN_ORDER
+        bad = np.abs(order - np.arange(len(order))) > (len(order) if has_no_order else _MOST_PLACES_LATE)
+        bad[1:] |= np.diff(stamps[order]) == 0
+        for line in lines[order[bad]].tolist():
             self.add(line, f"{what} must increase")
-        if good.sum() < _LEAST_IN_ORDER * len(good):
-            line = int(lines[~good][0])
+        if bad.sum() > (1 - _LEAST_IN_ORDER) * len(bad):
+            line = int(lines[order[bad]].min())
             raise self._error(f"{self._path}, line {line}: {what} must increase; sort the rows, a series a file")
+        good = order[~bad]
+        late = np.flatnonzero(np.diff(good) < 0)
+        if len(late):
+            line = int(lines[good[late + 1]].min())
+            logger.warning("%s: %s are not in order, first on line %d: the rows are sorted", self._path, what, line)
         return good
 
     def ordered(self, rows: Sequence[tuple[int, float, Path]], wanted: str) -> tuple[NDArray[np.float64], list[Path]]:
         """Stamps and files of an index, of its lines with both in the order of time; says which are left out."""
         stamps = np.array([stamp for _, stamp, _ in rows])
         good = self.in_order(stamps, "stamps", np.array([line for line, _, _ in rows], np.intp))
-        self.say(int(good.sum()), wanted)
-        return stamps[good], [rows[k][2] for k in np.flatnonzero(good)]
+        self.say(len(good), wanted)
+        return stamps[good], [rows[k][2] for k in good]
 
     def say(self, left: int, wanted: str) -> None:
         """Warn of the rows left out.
@@ -88,24 +98,6 @@ class BadRows:
             )
 
 
-def increasing(values: Sequence[float]) -> NDArray[np.bool_]:
-    """Which of the values ``(N,)`` belong to the longest strictly increasing series; of equal ones the first."""
-    ends: list[float] = []  # the smallest last value of a series of each length, and its place
-    places: list[int] = []
-    before: list[int] = []
-    for place, value in enumerate(values):
-        length = bisect_left(ends, value)
-        before.append(places[length - 1] if length else -1)
-        if length == len(ends) or ends[length] != value:
-            ends[length : length + 1], places[length : length + 1] = [value], [place]
-    chosen = np.zeros(len(values), dtype=bool)
-    place = places[-1] if places else -1
-    while place >= 0:
-        chosen[place] = True
-        place = before[place]
-    return chosen
-
-
 def is_number(word: str) -> bool:
     """Whether Python reads a number, without its underscores."""
     try:
@@ -117,3 +109,10 @@ def is_number(word: str) -> bool:
 def number_or_nan(word: str) -> float:
     """A number; NaN where the word is none."""
     return float(word) if is_number(word) else math.nan
+
+
+def in_seconds(word: str) -> str:
+    """A stamp as a number of seconds; whole milli- and microseconds since 1970 and nanoseconds have their point set."""
+    word = word.strip()
+    places = _FRACTIONS.get(len(word), 9 if len(word) >= _NANOSECOND_DIGITS else 0)
+    return f"{word[:-places]}.{word[-places:]}" if places and word.isdecimal() else word

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
-from slam.formats.rows import BadRows, is_number
+from slam.formats.rows import BadRows, in_seconds, is_number
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
@@ -26,13 +26,15 @@ logger = logging.getLogger(__name__)
 
 # columns of a row by format: KITTI's of 3x4 and of 4x4 with a frame number or without, TUM's without a stamp last
 _COLUMNS = {"kitti": (12, 13, 16, 17), "tum": (8, 7)}
-_NANOSECOND_DIGITS = 15  # of a stamp in nanoseconds, at least: seconds have 10
 # a TartanAir camera looks along x, with y to the right and z down
 _T_TARTAN_CAMERA = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST = 1e12  # metres: to Saturn
 _SAME_STAMP = 0.05  # of the period: stamps of one image differ by less
+_UNITS = {1: "milliseconds", 2: "microseconds", 3: "nanoseconds"}  # by powers of 1000
+_UNIT_TOLERANCE = 0.2  # of such a power: one of the two covers a quarter at least
+_LEAST_OF_OTHER_UNIT = 10  # matching rows, which are by chance
 _LONE_PERIOD_S = 0.04  # of a trajectory of one pose
 
 
@@ -110,7 +112,8 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
 
     A row of KITTI has 12 numbers, or the 16 of a 4x4 matrix, perhaps with the frame number first; one of TUM 8. Rows
     of 7 numbers are TartanVO's: position and quaternion of a camera that looks along x, with z down. EuRoC's columns
-    are separated by commas: nanoseconds, position, quaternion w x y z and others. A header, blank lines and those that
+    are separated by commas: nanoseconds, position, quaternion w x y z and others. Commas or semicolons may separate
+    the columns of all. Stamps are seconds, or whole milli-, micro- or nanoseconds. A header, blank lines and those that
     start with ``#`` are skipped; bad rows are left out (`slam.formats.rows`), and where rows have no stamps the others
     keep their numbers. Rotations that are not orthonormal by rounding are replaced by the nearest rotation.
 
@@ -146,7 +149,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     timed, numbered = columns == 8, columns in (13, 17)
     stamps = numbers[:, 0] if timed or numbered else rows.astype(np.float64)
     order = bad.in_order(stamps, "time stamps" if timed else "frame numbers", lines)
-    bad.say(int(order.sum()), "a pose a row")
+    bad.say(len(order), "a pose a row")
     T_world_camera = T_world_camera[order]
     T_world_camera[:, :3, :3] = se3.nearest_rotation(T_world_camera[:, :3, :3])
     count = len(order) + len(bad) if len(bad) and not (timed or numbered) else None
@@ -203,11 +206,12 @@ def associate(
     # Slack, because the tolerance itself is a difference of rounded stamps.
     within_s = matching_tolerance_s(estimate, reference) * (1.0 + 1e-6)
     rows_estimate, rows_reference = nearest_pairs(estimate.stamps, reference.stamps, within_s)
-    if not rows_estimate.size:
+    cure = other_unit(estimate.stamps, reference.stamps)
+    if not rows_estimate.size or (cure and len(rows_estimate) < _LEAST_OF_OTHER_UNIT):
         raise TrajectoryError(
             f"no time stamps match within {matching_tolerance_s(estimate, reference):.3g} s: the estimate "
             f"covers {_time_span(estimate)} and the reference {_time_span(reference)}; "
-            "bring both to the same clock"
+            f"{cure or 'bring both to the same clock'}"
         )
     expected = min(len(estimate), len(reference))
     if rows_estimate.size < 0.9 * expected:
@@ -219,6 +223,18 @@ def associate(
     if _period_s(estimate) < _period_s(reference):
         return estimate.at(pair[1].stamps), pair[1]
     return pair[0], reference.at(pair[0].stamps)
+
+
+def other_unit(stamps: FloatArray, others: FloatArray) -> str | None:
+    """What to do where two series of stamps of one drive last about 1000, 10^6 or 10^9 times as long; else None."""
+    if min(len(stamps), len(others)) < 2:
+        return None
+    thousands = float(np.log(np.ptp(stamps) / np.ptp(others)) / np.log(1000))
+    power = abs(round(thousands))
+    if power not in _UNITS or abs(abs(thousands) - power) > _UNIT_TOLERANCE:
+        return None
+    longer = max(stamps, others, key=np.ptp)
+    return f"stamps up to {longer[-1]:.0f} look like {_UNITS[power]}: divide them by {1000**power:.0e}"
 
 
 def _of_frames(trajectory: Trajectory, start: int, stop: int) -> Trajectory:
@@ -334,13 +350,16 @@ def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _words(line: str) -> list[str]:
     """The words of a row; of EuRoC's the stamp in seconds and the quaternion as TUM has them."""
-    words = [word.strip() for word in line.split(",")]
-    if len(words) < _COLUMNS["tum"][0] or any(" " in word for word in words):
-        words = line.split()
-    if len(words) >= _COLUMNS["tum"][0] and words[0].isdecimal() and len(words[0]) >= _NANOSECOND_DIGITS:
-        stamp = f"{words[0][:-9]}.{words[0][-9:]}"
-        words = [stamp, *words[1:4], *words[5:8], words[4]] if "," in line else [stamp, *words[1:]]
-    return words
+    separators = [separator for separator in ";," if line.count(separator) >= _COLUMNS["tum"][1] - 1]
+    words = [word.strip() for word in line.split(separators[0])] if separators else line.split()
+    if any(" " in word for word in words):  # a comma for the point
+        separators, words = [], line.split()
+    if len(words) < _COLUMNS["tum"][0]:
+        return words
+    stamp = in_seconds(words[0])
+    if separators and stamp != words[0]:
+        return [stamp, *words[1:4], *words[5:8], words[4]]
+    return [stamp, *words[1:]]
 
 
 def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:

@@ -33,7 +33,7 @@ _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
 _FOCAL = 0.04  # relative, of the focal length that corners show: flow and lens bias it
-_TELLING_FOCAL = 0.1  # largest sigma of one that says something
+_TELLING_FOCAL, _UNSEEN_FOCAL = 0.1, 0.2  # largest sigma of one that says something; of a camera that goes straight on
 # of good drives (docs/reliability.md): mean and spread
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
@@ -42,7 +42,7 @@ _FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners ov
 _CONTRADICTED_SPREAD = 0.007
 _LEAST_MOVED, _ALONG, _ASIDE_SPREAD = 0.1, np.cos(np.deg2rad(20.0)), 0.01  # of long steps; of their directions
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
-# of `share_right`, by tools/fit_confidence.py
+# of `share_right`, by tools/fit_confidence.py of commit 669cc2b1
 CONFIDENCE = (0.97, 3.0, 5.5)
 _CAPPED = 3.0  # sigmas of what leaves a confidence of less than a half
 
@@ -155,7 +155,8 @@ def of_images(
     steps = 0 if drive.maps else len(drive.steps.triangulated)  # lengths are then those of the maps
     on_road = len(drive.road_steps)
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
-    figure = f"{interpolated} of {frames} frames are interpolated, the places of {guessed} segments guessed"
+    figure = f"{interpolated} of {frames} frames are interpolated"
+    figure += f", the places of {guessed} segments guessed" if guessed else ""
     found = [("gaps", gaps, figure)]
     if steps:
         figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
@@ -190,18 +191,23 @@ def _overlap(support: FloatArray) -> tuple[float, str]:
 
 
 def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
-    """By the focal length that corners show; None where they show too little. A guess is a doubt in any case."""
+    """By the focal length that corners show; None where they show too little. A guess is a doubt in any case.
+
+    Of a camera that goes straight on, nothing tells a wrong one, whose lengths are as wrong: that leaves a doubt.
+    """
     logarithm, sigma = found.error or (0.0, np.inf)
     sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
     figure = "nobody calibrated it" if camera.is_guess else ""
     if sigma < _TELLING_FOCAL or sigmas > DOUBTFUL:
-        figure += f"{', ' if figure else ''}corners show {100 * np.exp(logarithm):.0f} % of it"
-        figure += f", with a sigma of {100 * sigma:.0f} %"
+        figure += f"{', ' if figure else ''}measured from corners it is {100 * np.exp(logarithm):.0f} % of the given"
+        figure += f", give or take {100 * sigma:.0f} %"
         if sigmas > DOUBTFUL:
             fov = 2.0 * np.arctan(camera.width / (2.0 * camera.fx * np.exp(logarithm)))
             figure += f": try fov={np.rad2deg(fov):.0f}"
     if camera.is_guess:
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
+    if sigma > _UNSEEN_FOCAL and sigmas <= DOUBTFUL:
+        return Agreement("the focal length", DOUBTFUL, "nothing turns, so that corners do not show it")
     return Agreement("the focal length", sigmas, figure) if figure else None
 
 

@@ -25,14 +25,13 @@ from slam.frames import (
     runs,
 )
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.segments import Segment
 from slam.frontend.step_table import StepTable
-from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.frontend.visual.motion import Motion, RelativeRotation
 from slam.geometry.se3 import FloatArray
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 

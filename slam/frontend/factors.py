@@ -8,11 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
-from slam.frontend.keyframes.gaps import join_gap_ends
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, join_gap_ends
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
@@ -29,20 +27,20 @@ from slam.geometry.se3 import FloatArray, compose, rigid
 logger = logging.getLogger(__name__)
 
 
-def make_factors(drive: Drive, scale: Scale, visual_odometry: VisualOdometryConfig) -> list[RelativePose]:
+def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[RelativePose]:
     """All relative poses with their noise, in the unit of the scale.
 
     Args:
         drive: completed.
         scale: of each frame, and the lengths of steps.
-        visual_odometry: noise of image geometry.
+        level: of the line in the log that says what the pose network measured.
     """
     maps = drive.map_poses
-    geometric = _geometric(drive.steps, scale, visual_odometry)
+    geometric = _geometric(drive.steps, scale)
     by_keyframes = scaled_poses(maps.poses, maps, scale)
     steps = network_steps(drive.trusted)
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
-    logger.info("pose network: %s", calibration.over(scale.per_frame))
+    logger.log(level, "pose network: %s", calibration.over(scale.per_frame))
     networks = network_factors(steps, calibration)
     if not calibration.is_measured:  # lengths in the wrong unit have no say beside measured ones
         by_geometry = {pose.ends for pose in geometric}
@@ -53,18 +51,6 @@ def make_factors(drive: Drive, scale: Scale, visual_odometry: VisualOdometryConf
     )
     interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
     return [*by_network, *interpolated, *by_image, *by_keyframes]
-
-
-def scaled_steps(drive: Drive, scale: Scale) -> list[RelativePose]:
-    """Steps of the network, interpolated and of image geometry in the unit of the scale, the last without noise."""
-    interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
-    by_image = []
-    for ends, motion in drive.steps.motions.items():
-        length, pose = scale.lengths.get(ends) if motion.is_triangulated else None, motion.relative_pose
-        by_image.append(scale.scaled(pose) if length is None else pose.scaled(length.value / motion.length_unscaled))
-    steps = network_steps(drive.trusted)
-    by_network = network_factors(steps, calibrate_network(steps, by_image, scale.per_frame))
-    return [*by_network, *interpolated, *by_image]
 
 
 def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
@@ -111,9 +97,9 @@ def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
     return factor.source == KEYFRAME_SOURCE, factor.source != NETWORK_SOURCE, factor.from_index
 
 
-def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> list[RelativePose]:
+def _geometric(steps: StepTable, scale: Scale) -> list[RelativePose]:
     """Every step of image geometry: with its own length where that was measured, else by learned depth."""
-    noise = _step_noise(steps, scale, config)
+    noise = _step_noise(steps, scale)
     factors = []
     for ends, motion in steps.motions.items():
         length = scale.lengths.get(ends)
@@ -125,11 +111,11 @@ def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> 
     return factors
 
 
-def _step_noise(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> Mapping[Ends, StepNoise]:
+def _step_noise(steps: StepTable, scale: Scale) -> Mapping[Ends, StepNoise]:
     """Noise of the triangulated steps besides that of the corners, by their order in the drive."""
     motions = steps.triangulated
     place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}
     T_by_place = {n: motions[ends].relative_pose.T_from_to for ends, n in place.items()}
     own = {n: motions[ends].own_noise for ends, n in place.items()}
-    inflated = inflate_step_sigmas(T_by_place, own, config)
+    inflated = inflate_step_sigmas(T_by_place, own)
     return {ends: inflated[n] for ends, n in place.items()}

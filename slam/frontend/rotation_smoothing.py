@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends
 from slam.frontend.step_table import StepTable, path_between, shortest_by_start
-from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.frontend.visual.motion import RelativeRotation
 from slam.geometry.se3 import FloatArray, invert
 
 # sigmas of single steps are widened by this: the errors of neighbouring steps are correlated

@@ -17,7 +17,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from slam.config.sections import PoseGraphConfig
 from slam.formats.g2o import write_g2o
 from slam.frames import LOOP_SOURCE, MeasuredPosition, RelativePose
 from slam.geometry.se3 import FloatArray, invert, is_se3
@@ -25,7 +24,9 @@ from slam.runtime.errors import SlamError
 
 _ANCHOR_SIGMA = 1e-6
 _LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
-_OUTLYING = 3.0
+HUBER_K = 1.345  # whitened residual at which the loss becomes linear: 95 % efficient for normal errors
+# of a loop that is removed: whitened residual, and over the median of all loops
+_LARGEST_LOOP_RESIDUAL, _OUTLYING = 8.0, 3.0
 _MAX_ITERATIONS = 100  # of Levenberg-Marquardt
 _MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
 _RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
@@ -36,8 +37,7 @@ logger = logging.getLogger(__name__)
 class PoseGraph:
     """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 is fixed as the world frame."""
 
-    def __init__(self, config: PoseGraphConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._relative_poses: list[RelativePose] = []
         self._dropped: list[RelativePose] = []
         self._T_world_camera: FloatArray | None = None
@@ -117,7 +117,7 @@ class PoseGraph:
         if not is_loop.any():
             return ()
         typical = float(np.median(np.sqrt(squared[is_loop])))
-        limit = max(self._config.max_loop_residual, _OUTLYING * typical)
+        limit = max(_LARGEST_LOOP_RESIDUAL, _OUTLYING * typical)
         beyond = is_loop & (squared > limit**2)
         gone = tuple(edge for edge, out in zip(self._relative_poses, beyond, strict=True) if out)
         self._relative_poses = [edge for edge, out in zip(self._relative_poses, beyond, strict=True) if not out]
@@ -170,9 +170,9 @@ class PoseGraph:
         graph = gtsam.NonlinearFactorGraph()
         graph.add(_anchor(values.atPose3(0), is_loose=bool(self._positions)))
         for edge in self._relative_poses:
-            graph.add(_between(edge, self._config))
+            graph.add(_between(edge))
         for position in self._positions:
-            graph.add(_position(position, self._config))
+            graph.add(_position(position))
         return graph
 
     def _minimise(self, values: Any) -> Any:
@@ -183,8 +183,7 @@ class PoseGraph:
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         solved = optimiser.optimize()
         logger.info(
-            "pose graph (%s): %d factors, error %.4g to %.4g in %d iterations",
-            self._config.kernel,
+            "pose graph: %d factors, error %.4g to %.4g in %d iterations",
             len(self._relative_poses),
             graph.error(values),
             optimiser.error(),
@@ -227,21 +226,19 @@ def _anchor(pose: Any, is_loose: bool = False) -> Any:
     return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
-def _between(edge: RelativePose, config: PoseGraphConfig) -> Any:
-    noise = _noise(edge.graph_sigmas, config)
+def _between(edge: RelativePose) -> Any:
+    noise = _noise(edge.graph_sigmas)
     return gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise)
 
 
-def _position(measured: MeasuredPosition, config: PoseGraphConfig) -> Any:
-    noise = _noise(measured.sigmas, config)
+def _position(measured: MeasuredPosition) -> Any:
+    noise = _noise(measured.sigmas)
     return gtsam.GPSFactor(measured.index, measured.position, noise)
 
 
-def _noise(sigmas: FloatArray, config: PoseGraphConfig) -> Any:
+def _noise(sigmas: FloatArray) -> Any:
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
-    if config.kernel == "none":
-        return noise
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(config.huber_k), noise)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
 
 
 def _check(edge: RelativePose) -> None:

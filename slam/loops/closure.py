@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
-from slam.geometry.se3 import FloatArray, path_distance
-from slam.loops.consistency import agreeing
-from slam.loops.retrieval import find_candidates, least_path
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
+from slam.geometry.se3 import FloatArray
+from slam.loops.consistency import Track, agreeing
+from slam.loops.retrieval import Apart, find_candidates
+from slam.loops.verification import Loop, LoopThresholds, LoopVerifier, RejectedLoop
 from slam.runtime.threads import side_by_side
 
 logger = logging.getLogger(__name__)
 
 MOST_REJECTED = 200
+# least distance of the two frames of a loop along the path: in metres, and over the median depth of the corners
+_LEAST_PATH_M = 15.0
+_LEAST_PATH_OVER_DEPTH = 0.75
+_LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
 _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 
 
@@ -108,19 +112,51 @@ def close_loops(
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
-    path = path_distance(T_world_camera)[np.array([view.index for view in views], dtype=int)]
-    least = least_path(views, is_metric)
-    candidates = find_candidates(views, path, least)
-    thresholds = LoopThresholds.of_frames(config)
-    verifier = LoopVerifier(thresholds, intrinsics, seed)
+    track, least = Track.of_drive(T_world_camera), _least_path(views, is_metric)
+    frames = np.array([view.index for view in views], dtype=np.intp)
+
+    def apart(rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        is_later = frames[rows, None] - frames >= _LEAST_GAP_FRAMES
+        return np.asarray(is_later & (track.path[frames][rows, None] - track.path[frames] >= least))
+
+    closures = find_loops(views, track, apart, LoopVerifier(LoopThresholds.of_frames(config), intrinsics, seed))
+    return replace(closures, accepted=tuple(_counted_once(closures.accepted, track.path, _SAME_PLACE * least)))
+
+
+def find_loops(views: Sequence[View], track: Track, apart: Apart, verifier: LoopVerifier) -> LoopClosures:
+    """Loops among the views of a track that are verified and agree with each other.
+
+    Args:
+        views: in time order, of some rows of the track, their points in the units of their maps.
+        track: the odometry.
+        apart: which views may make a loop, see `find_candidates`.
+        verifier: of candidates.
+    """
+    candidates = find_candidates(views, apart, verifier.thresholds)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
-    refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
-    kept, lonely = agreeing(verified, T_world_camera, thresholds)
-    accepted = _counted_once(kept, path_distance(T_world_camera), _SAME_PLACE * least)
+    accepted, rejected = agreeing(verified, track, verifier.thresholds)
+    rejected += [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
     logger.info("loops: %d candidates, %d verified, %d accepted", len(candidates), len(verified), len(accepted))
-    refused.sort(key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index))
-    return LoopClosures(len(candidates), len(verified), tuple(accepted), tuple(lonely + refused))
+    return LoopClosures(len(candidates), len(verified), tuple(accepted), most_inliers_first(rejected))
+
+
+def most_inliers_first(loops: Iterable[RejectedLoop]) -> tuple[RejectedLoop, ...]:
+    """Rejected loops in the order in which they are reported."""
+    return tuple(sorted(loops, key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index)))
+
+
+def _least_path(views: Sequence[View], is_metric: bool) -> float:
+    """Least distance of the two frames of a loop along the path, in the unit of the points of the views.
+
+    It is 15 m. Where lengths are no metres, it is three quarters of the median depth of the corners: a camera that has
+    moved less still sees what it saw, whatever the unit and the frame rate, and on streets these are 12 to 19 m.
+    """
+    if is_metric:
+        return _LEAST_PATH_M
+    depths = np.concatenate([np.zeros(0), *(view.points[:, 2] for view in views)])
+    depths = depths[np.isfinite(depths)]
+    return _LEAST_PATH_OVER_DEPTH * float(np.median(depths)) if len(depths) else np.inf
 
 
 def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[Loop]:

@@ -1,20 +1,32 @@
-"""Features of a frame for loop closure: ORB (Rublee et al. 2011) and 3-D points from learned depth."""
+"""Binary descriptors of corners, by which these are known again in images far apart.
+
+Frames of a drive have ORB (Rublee et al. 2011) at corners of its own. Corners that are tracked have SIFT (Lowe 2004) as
+256 bits, so that words, matching and files are the same: two thresholds code a value, and Hamming's distance is the
+distance between the sums of coded differences.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View, nearest_depth, trusted_depth
+from slam.geometry.se3 import FloatArray
 
 _CELL_PX = 32
 _DETECTED_PER_KEPT = 4
 _EDGE_PX = 16
 _CORNER_CONTRAST = 10  # least contrast of a corner, grey levels
 _MAX_FEATURES = 500  # largest number of corners kept of a frame
+_SIFT_SIZE_PX = 8.0
+# terciles of square roots of SIFT's normed values (Arandjelovic and Zisserman 2012) over the corners of a kitchen
+_LOW, _HIGH = 0.034, 0.082
+_RADIUS_PX = 15
+_BLUR_PX = 2.0
 
 
 class FeatureExtractor:
@@ -44,12 +56,27 @@ class FeatureExtractor:
 
     def corners(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
-        found = self._orb.detect(grey, None)
-        strongest = _strongest_per_cell(found, grey.shape, _MAX_FEATURES)
-        chosen, descriptors = self._orb.compute(grey, [found[k] for k in strongest])
+        detected = self._orb.detect(grey, None)
+        strongest = _strongest_per_cell(detected, grey.shape, _MAX_FEATURES)
+        chosen, descriptors = self._orb.compute(grey, [detected[k] for k in strongest])
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
         return np.array([keypoint.pt for keypoint in chosen], np.float32), descriptors
+
+
+def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
+    """Descriptors ``(M, 32)`` of corners ``(M, 2)``, each turned into its own direction."""
+    if not len(pixels):
+        return np.zeros((0, 32), np.uint8)
+    # at half the size a quarter of the pixels describe the same surroundings
+    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    corners = [
+        cv2.KeyPoint(0.5 * float(u) - 0.25, 0.5 * float(v) - 0.25, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0)
+        for (u, v), angle in zip(pixels, _directions_deg(grey, pixels), strict=True)
+    ]
+    _, values = cv2.SIFT.create().compute(half, corners)
+    roots = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-9))
+    return np.packbits(np.concatenate([roots > _LOW, roots > _HIGH], axis=1), axis=1)
 
 
 def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
@@ -73,3 +100,16 @@ def _strongest_per_cell(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...
     rank = np.arange(len(by_cell)) - first_of_cell
     order = by_cell[np.lexsort((-response[by_cell], rank))]
     return np.asarray(order[:count])
+
+
+def _directions_deg(grey: Grey, pixels: NDArray[np.floating[Any]]) -> FloatArray:
+    """From each corner to the centroid of the grey levels around it (Rosin 1999), degrees in [0, 360)."""
+    y, x = np.mgrid[-_RADIUS_PX : _RADIUS_PX + 1, -_RADIUS_PX : _RADIUS_PX + 1]
+    inside = x**2 + y**2 <= _RADIUS_PX**2
+    x, y = x[inside], y[inside]
+    border = _RADIUS_PX + 1
+    blurred = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
+    padded = cv2.copyMakeBorder(blurred, border, border, border, border, cv2.BORDER_REFLECT)
+    u, v = np.rint(pixels).astype(np.int64).T + border
+    around = padded[v[:, None] + y, u[:, None] + x].astype(np.float64)
+    return np.asarray(np.rad2deg(np.arctan2(around @ y, around @ x)) % 360.0)

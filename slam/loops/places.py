@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from erfsfm.common.readers.pinhole import Pinhole, impossible
 from slam.frames import Intrinsics, View
 from slam.geometry.se3 import FloatArray, is_se3
-from slam.runtime.errors import RunError, SlamError
+from slam.runtime.errors import RunError
 
 _FORMAT = 1
 # kind and shape of each array, for V views and M corners
@@ -60,50 +58,37 @@ class Places:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        with _reading(path), np.load(path, allow_pickle=False) as file:
-            content = {name: file[name] for name in ("format", *_ARRAYS)}
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                content = {name: file[name] for name in ("format", *_ARRAYS)}
+                undistorted = "undistorted" in file and bool(file["undistorted"])
             if int(content["format"]) != _FORMAT:
                 raise RunError(f"{path} has format {content['format']}, this version reads {_FORMAT}: run again")
             _check(content)
-            width, height, *pinhole = content["camera"].tolist()
-            frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
-            # the part after the last view is empty
-            parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
-            views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
-            undistorted = "undistorted" in file and bool(file["undistorted"])
-            camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
-            return cls(camera, views, content["T_world_camera"])
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn any failure inside the block into one line about ``path``; a `SlamError` is passed on.
-
-    Raises:
-        RunError: the file is missing, unreadable or damaged.
-    """
-    try:
-        yield
-    except SlamError:
-        raise
-    except FileNotFoundError as error:
-        raise RunError(f"{path} is missing: run the sequence again") from error
-    except MemoryError as error:
-        raise RunError(f"{path} needs more memory than there is, or is damaged: free some, or run again") from error
-    # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types is complete.
-    except Exception as error:
-        reason = " ".join(str(error).split())[:120]
-        detail = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
-        raise RunError(f"{path} is damaged ({detail}): run the sequence again") from error
+        except FileNotFoundError as error:
+            raise RunError(f"{path} is missing: run the sequence again") from error
+        except RunError:
+            raise
+        # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types is complete.
+        except Exception as error:
+            reason = " ".join([f"{type(error).__name__}:", *str(error).split()])[:120]
+            raise RunError(f"{path} is damaged ({reason}): run the sequence again") from error
+        width, height, *pinhole = content["camera"].tolist()
+        frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
+        # the part after the last view is empty
+        parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
+        views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
+        camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
+        return cls(camera, views, content["T_world_camera"])
 
 
 def _check(content: dict[str, NDArray[Any]]) -> None:
     """Refuse arrays that do not belong together, with a ``ValueError``."""
     sizes: dict[int | str, int] = {"V": len(content["frames"]), "M": int(content["counts"].sum())}
     for name, (kind, shape) in _ARRAYS.items():
-        array, wanted = content[name], tuple(sizes.get(side, side) for side in shape)
-        if array.dtype.kind != kind or array.shape != wanted:
-            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {wanted}")
+        array, expected = content[name], tuple(sizes.get(side, side) for side in shape)
+        if array.dtype.kind != kind or array.shape != expected:
+            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {expected}")
     if (content["counts"] < 0).any() or (np.diff(content["frames"], prepend=-1) <= 0).any():
         raise ValueError("frames do not increase, or a count is negative")
     T_world_camera = content["T_world_camera"]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from slam.frames import Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.retrieval import PlaceIndex
-from slam.loops.thresholds import OF_KEYFRAMES
-from slam.loops.verification import LoopVerifier, Sighting, matches
+from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches
 
 _PLACES_TRIED = 6
 # a single image has no points of its own that would confirm the pose, so it takes twice those of a loop
@@ -65,12 +64,12 @@ class Relocaliser:
         best: Sighting | None = None
         for keyframe in np.unique(keyframes):
             here = keyframes == keyframe
-            found = self._verifier.resect(points[here].astype(np.float32), image.pixels[rows[here, 1]])
-            if isinstance(found, Sighting) and (best is None or found.inliers > best.inliers):
-                best = found
+            seen = self._verifier.resect(points[here].astype(np.float32), image.pixels[rows[here, 1]])
+            if isinstance(seen, Sighting) and (best is None or len(seen.inliers) > len(best.inliers)):
+                best = seen
         if best is None:
             return None
-        X = apply(best.T_image_points, points)
+        X = apply(best.T_camera_points, points)
         ahead = X[:, 2] > 0
         X[~ahead, 2] = 1.0
         residual = np.linalg.norm(self._intrinsics.project(X) - image.pixels[rows[:, 1]], axis=1)
@@ -79,7 +78,7 @@ class Relocaliser:
         kept = kept[first]
         if len(kept) < _LEAST_POINTS:
             return None
-        return Relocalised(best.T_image_points, rows[kept, 1], keyframes[kept], rows[kept, 0])
+        return Relocalised(best.T_camera_points, rows[kept, 1], keyframes[kept], rows[kept, 0])
 
     def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
         """Keyframes ``(M,)``, rows of their corners and of the image's ``(M, 2)``, and points in the map ``(M, 3)``."""

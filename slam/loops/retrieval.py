@@ -6,7 +6,7 @@ few enough frames for it, and words trained on its own images discriminate bette
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,20 +16,15 @@ from scipy.sparse import csr_array
 from slam.frames import Descriptors, View
 from slam.geometry.se3 import FloatArray
 from slam.loops.descriptors import hamming
+from slam.loops.verification import LoopThresholds
 from slam.runtime.threads import side_by_side
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
 _BLOCK = 256
 _BLOCK_DESCRIPTORS = 200  # fit the processor's cache
-_CANDIDATES_PER_FRAME = 2  # largest number of places verified for a frame
-_PEAK_FRAMES = 10  # least distance between candidate places, frames
-_MIN_SCORE = 0.2  # least retrieval score, relative to that of neighbouring frames
 _WORDS = 1000  # size of the binary vocabulary learned on the run
-# least distance of the two frames of a loop along the path: in metres, and over the median depth of the corners
-_LEAST_PATH_M = 15.0
-_LEAST_PATH_OVER_DEPTH = 0.75
-_LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
+Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -41,64 +36,28 @@ class Candidate:
     score: float
 
 
-def least_path(views: Sequence[View], is_metric: bool) -> float:
-    """Least distance of the two frames of a loop along the path, in the unit of the points of the views.
-
-    It is 15 m. Where lengths are no metres, it is three quarters of the median depth of the corners: a camera that has
-    moved less still sees what it saw, whatever the unit and the frame rate, and on streets these are 12 to 19 m.
-    """
-    if is_metric:
-        return _LEAST_PATH_M
-    depths = np.concatenate([np.zeros(0), *(view.points[:, 2] for view in views)])
-    depths = depths[np.isfinite(depths)]
-    return _LEAST_PATH_OVER_DEPTH * float(np.median(depths)) if len(depths) else np.inf
-
-
-def find_candidates(views: Sequence[View], path: FloatArray, least_path: float) -> list[Candidate]:
-    """For each view the most similar earlier views, the best first, none within 30 frames.
+def find_candidates(views: Sequence[View], apart: Apart, thresholds: LoopThresholds) -> list[Candidate]:
+    """For each view the most similar earlier views, the best first.
 
     Args:
         views: in time order.
-        path: distance driven up to each view ``(V,)``.
-        least_path: distance along the path within which there is no candidate, in the same unit.
+        apart: of some views ``(B,)``, by their rows, and all views: whether they may make a loop ``(B, V)``.
+        thresholds: how many candidates, how similar, and how far from each other.
     """
     if len(views) < 2 or not any(map(len, views)):
         return []
     weighted = PlaceIndex(views).weights
-    indices = np.array([view.index for view in views])
-    rows = np.arange(len(views))
+    indices, rows = np.array([view.index for view in views]), np.arange(len(views))
     neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
     expected = np.maximum(np.concatenate([neighbour[:1], neighbour]), 1e-3)
-    found = []
+    candidates = []
     for start in range(0, len(views), _BLOCK):
         block = rows[start : start + _BLOCK]
         scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
-        near = indices[block, None] - indices[None, :] < _LEAST_GAP_FRAMES
-        near |= path[block, None] - path[None, :] < least_path
-        scores[near] = 0.0
+        scores[~apart(block) | (rows >= block[:, None])] = 0.0
         for later, row in zip(block, scores, strict=True):
-            found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices)]
-    return found
-
-
-def similar_views(views: Sequence[View], allowed: NDArray[np.bool_], count: int) -> list[Candidate]:
-    """For each view at most ``count`` earlier ones that share words with it, the most similar first.
-
-    Args:
-        views: in time order.
-        allowed: ``(V, V)``, which pairs may be candidates.
-        count: of candidates.
-    """
-    if len(views) < 2 or not any(map(len, views)):
-        return []
-    weighted = PlaceIndex(views).weights
-    found = []
-    for later in range(1, len(views)):
-        scores = (weighted[[later]] @ weighted[:later].T).toarray().ravel()
-        scores[~allowed[later, :later]] = 0.0
-        best = np.argsort(-scores, kind="stable")[:count]
-        found += [Candidate(int(k), later, float(scores[k])) for k in best if scores[k] > 0]
-    return found
+            candidates += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices, thresholds)]
+    return candidates
 
 
 class PlaceIndex:
@@ -169,14 +128,14 @@ def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:
     return weights
 
 
-def _peaks(scores: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.int64]]) -> list[int]:
-    """The best columns, none within ten frames of a better one."""
+def _peaks(scores: FloatArray, indices: NDArray[np.intp], thresholds: LoopThresholds) -> list[int]:
+    """The best columns, none near a better one."""
     scores = scores.copy()
     peaks: list[int] = []
-    while len(peaks) < _CANDIDATES_PER_FRAME:
+    while len(peaks) < thresholds.candidates:
         best = int(np.argmax(scores))
-        if scores[best] < _MIN_SCORE or scores[best] <= 0:
+        if scores[best] < thresholds.least_score or scores[best] <= 0:
             break
         peaks.append(best)
-        scores[np.abs(indices - indices[best]) <= _PEAK_FRAMES] = 0.0
+        scores[np.abs(indices - indices[best]) <= thresholds.candidate_spacing] = 0.0
     return peaks

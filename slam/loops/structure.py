@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.geometry.triangulation import reprojection_errors, triangulate
 from slam.loops.places import Places
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import matches
+from slam.loops.verification import LoopThresholds, matches
 
 _NEIGHBOURS = 4  # places on either side that a place is matched with
 _LEAST_SIGHTINGS = 3
@@ -78,10 +77,10 @@ class PlaceStructure:
         """Corners of all places joined to points that three or more of them see."""
         first = self._first
         around = [self._around(row) for row in range(len(self._places.views))]
-        known = [np.isfinite(each.points[each.point, 0]) for each in around]
+        known = [np.isfinite(nearby.points[nearby.point, 0]) for nearby in around]
         ends = [
-            (first[row] + each.point[kept], first[each.views[kept]] + each.corners[kept])
-            for row, (each, kept) in enumerate(zip(around, known, strict=True))
+            (first[row] + nearby.point[kept], first[nearby.views[kept]] + nearby.corners[kept])
+            for row, (nearby, kept) in enumerate(zip(around, known, strict=True))
         ]
         one, other = (np.concatenate(side) for side in zip(*ends, strict=True))
         joined = csr_array((np.ones(len(one)), (one, other)), (first[-1], first[-1]))
@@ -93,12 +92,12 @@ class PlaceStructure:
 
     def _triangulated_around(self, row: int) -> Tracks:
         """A point for each corner of a place, by the places around it."""
-        place, found = self._places.views[row], []
+        place, pairings = self._places.views[row], []
         for other in range(max(0, row - _NEIGHBOURS), min(len(self._places.views), row + _NEIGHBOURS + 1)):
-            own = np.arange(len(place))
-            pairs = (own, own) if other == row else matches(place, self._places.views[other], self._thresholds)
-            found.append((np.full(len(pairs[0]), other), *pairs))
-        views, corners, seen = (np.concatenate(column) for column in zip(*found, strict=True))
+            rows = np.arange(len(place))
+            pairs = (rows, rows) if other == row else matches(place, self._places.views[other], self._thresholds)
+            pairings.append((np.full(len(pairs[0]), other), *pairs))
+        views, corners, seen = (np.concatenate(column) for column in zip(*pairings, strict=True))
         return self._triangulated(views, seen, corners, len(place))
 
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:

@@ -1,38 +1,113 @@
-"""Verification of a loop candidate: perspective-n-point on learned depth, in both directions.
+"""Verification of a loop candidate: perspective-n-point on the points of two views, in both directions.
 
 All thresholds are independent of scale: pixels, ratios, degrees, and lengths over the depth of the points.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
-from slam.geometry.resection import Resection, consensus, refine
-from slam.geometry.se3 import FloatArray, invert, make, rotation_angle
+from slam.geometry.resection import consensus, resect
+from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_angle
 from slam.loops.descriptors import hamming
-from slam.loops.thresholds import LoopThresholds
 
 _RATIO = 0.85  # largest ratio of nearest to second nearest descriptor distance
 _RANSAC_ITERATIONS = 200  # RANSAC iterations of PnP
 _CORNER_SIGMA_WIDENING = 1.25  # factor on the sigmas by corners
-_ROTATION_FLOOR_DEG = 0.02  # least rotation sigma, degrees
-_TRANSLATION_FLOOR_RATIO = 0.0003  # least translation sigma over the depth
 _LENGTH_RELATIVE_SIGMA = 0.04  # translation sigma over the translation
 _MIN_SPREAD_RATIO = 0.1  # least standard deviation of the inliers' columns over the image width
+_LEAST_SCALES = 8  # corners with points in both views, which give the ratio of their units
 
 
 @dataclass(frozen=True)
+class LoopThresholds:
+    """Independent of scale: pixels, ratios, degrees. Distances and drift of support are by frames or by keyframes.
+
+    Attributes:
+        min_inliers: least number of inliers in each direction.
+        agreement_deg: largest difference of the rotations measured in both directions.
+        agreement_ratio: largest difference of the translations measured in both directions, over the depth.
+        min_support: least number of images with loops nearby that agree.
+        candidates: largest number of places verified for a view.
+        candidate_spacing: least distance between these, frames.
+        least_score: least similarity of a candidate, over that of neighbouring views.
+        max_hamming: largest Hamming distance of matching descriptors, bits.
+        reprojection_px: largest reprojection error of an inlier.
+        min_inlier_ratio: among the matches with depth.
+        max_drift_ratio: largest correction over the path between both ends.
+        support_distance: of both ends, within which loops must agree.
+        support_drift_deg: rotation drift of the odometry between supporting loops, per frame or keyframe.
+        alone_inliers: number of inliers from which on a loop needs no support.
+        rotation_floor_deg: least rotation sigma.
+        translation_floor_ratio: least translation sigma over the depth.
+        has_units: whether the points of both views may have different units.
+    """
+
+    min_inliers: int
+    agreement_deg: float
+    agreement_ratio: float
+    min_support: int
+    candidates: int = 2
+    candidate_spacing: int = 10
+    least_score: float = 0.2
+    max_hamming: int = 64
+    reprojection_px: float = 3.0
+    min_inlier_ratio: float = 0.4
+    max_drift_ratio: float = 0.3
+    support_distance: int = 20
+    support_drift_deg: float = 0.1
+    alone_inliers: int = 120
+    rotation_floor_deg: float = 0.02
+    translation_floor_ratio: float = 0.0003
+    has_units: bool = False
+
+    @classmethod
+    def of_frames(cls, config: LoopsConfig) -> Self:
+        """The conditions of loops between frames of a drive."""
+        return cls(config.min_inliers, config.agreement_deg, config.agreement_ratio, config.min_support)
+
+
+# keyframes' points are exact within a map that drifts, their descriptors further apart in distance and roll
+OF_KEYFRAMES = LoopThresholds(
+    min_inliers=15,
+    agreement_deg=4.0,
+    agreement_ratio=0.15,
+    min_support=1,
+    candidates=12,
+    candidate_spacing=0,
+    least_score=0.0,
+    max_hamming=100,
+    reprojection_px=4.0,
+    min_inlier_ratio=0.3,
+    support_distance=4,
+    support_drift_deg=0.5,
+    alone_inliers=40,
+    rotation_floor_deg=0.5,
+    translation_floor_ratio=0.02,
+    has_units=True,
+)
+
+
+@dataclass(frozen=True, eq=False)
 class Loop:
-    """A verified loop; ``inliers`` is the smaller of both directions."""
+    """A verified loop; ``inliers`` is the smaller of both directions.
+
+    ``measured`` is in the unit of the earlier view, ``scale`` that of the later one in it. ``corners`` ``(M, 2)`` are
+    rows of corners of the earlier and of the later view that show one point.
+    """
 
     measured: RelativePose
     inliers: int
     score: float
+    scale: float = 1.0
+    corners: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -66,101 +141,94 @@ class RejectedLoop:
         return replace(self, T_from_to=make(self.T_from_to[:3, :3], scale * self.T_from_to[:3, 3]))
 
 
-class LoopVerifier:
-    """Measures ``T_earlier_later`` between two views of one camera, in the unit of their points."""
+class Sighting(NamedTuple):
+    """Points seen by a camera: ``T_camera_points``, its ``sigmas`` ``(6,)``, rows of the ``inliers``.
 
-    def __init__(
-        self,
-        thresholds: LoopThresholds,
-        intrinsics: Intrinsics,
-        seed: int = 0,
-    ) -> None:
-        self._thresholds = thresholds
+    ``depth`` is their median z-depth in the camera that measured them.
+    """
+
+    T_camera_points: FloatArray
+    sigmas: FloatArray
+    inliers: NDArray[np.intp]
+    depth: float
+
+
+class LoopVerifier:
+    """Measures ``T_earlier_later`` between two views of one camera, in the unit of the points of the earlier one."""
+
+    def __init__(self, thresholds: LoopThresholds, intrinsics: Intrinsics, seed: int = 0) -> None:
+        self.thresholds = thresholds
         self._intrinsics = intrinsics
         self._seed = seed
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
         """Measure the pose of the later view in the earlier one, or reject it with a reason."""
-        rows_earlier, rows_later = matches(earlier, later, self._thresholds)
+        rows_earlier, rows_later = matches(earlier, later, self.thresholds)
 
         def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
             return RejectedLoop(earlier.index, later.index, reason, score, inliers, T)
 
-        if len(rows_earlier) < self._thresholds.min_inliers:
+        if len(rows_earlier) < self.thresholds.min_inliers:
             return refused(f"only {len(rows_earlier)} matches")
-        forward = self.resect(earlier.points[rows_earlier], later.pixels[rows_later])
+        points_earlier, points_later = earlier.points[rows_earlier], later.points[rows_later]
+        forward = self.resect(points_earlier, later.pixels[rows_later])
         if isinstance(forward, str):
             return refused(forward)
-        backward = self.resect(later.points[rows_later], earlier.pixels[rows_earlier])
-        T_earlier_later = invert(forward.T_image_points)
+        backward = self.resect(points_later, earlier.pixels[rows_earlier])
+        T_earlier_later = invert(forward.T_camera_points)
         if isinstance(backward, str):
-            return refused(f"backwards {backward}", forward.inliers, T_earlier_later)
-        inliers = min(forward.inliers, backward.inliers)
-        difference = forward.T_image_points @ backward.T_image_points
+            return refused(f"backwards {backward}", len(forward.inliers), T_earlier_later)
+        inliers = min(len(forward.inliers), len(backward.inliers))
+        scale = _scale(points_earlier, points_later, forward, backward) if self.thresholds.has_units else 1.0
+        if scale is None:
+            return refused("few corners have points in both views", inliers, T_earlier_later)
+        T_again = backward.T_camera_points.copy()
+        T_again[:3, 3] *= scale
+        difference = forward.T_camera_points @ T_again
         rotation_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
-        depth = min(forward.depth, backward.depth)
+        depth = min(forward.depth, scale * backward.depth)
         translation_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
-        if rotation_deg > self._thresholds.agreement_deg or translation_ratio > self._thresholds.agreement_ratio:
+        if rotation_deg > self.thresholds.agreement_deg or translation_ratio > self.thresholds.agreement_ratio:
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
             return refused(reason, inliers, T_earlier_later)
-        T_middle = _halfway(T_earlier_later, backward.T_image_points)
-        sigmas = self._sigmas(T_middle, depth, difference, forward, backward)
+        T_middle = _halfway(T_earlier_later, T_again)
+        sigmas = self._sigmas(T_middle, depth, difference, forward.sigmas, backward.sigmas * np.repeat([1.0, scale], 3))
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
-        return Loop(measured, inliers, score)
+        shared = np.union1d(forward.inliers, backward.inliers)
+        return Loop(measured, inliers, score, scale, np.column_stack([rows_earlier[shared], rows_later[shared]]))
 
     def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
-        """The camera pose from ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or the reason for none.
-
-        Points with NaN are left out.
-        """
-        thresholds = self._thresholds
-        known = np.isfinite(points).all(axis=1)
+        """The camera that sees points ``(M, 3)``, NaN where unknown, at pixels ``(M, 2)``; or why not."""
+        thresholds, K = self.thresholds, self._intrinsics.K
+        known = np.flatnonzero(np.isfinite(points).all(axis=1))
         points_known, pixels_known = points[known].astype(np.float64), pixels[known].astype(np.float64)
-        if len(points_known) < thresholds.min_inliers:
-            return f"only {len(points_known)} matches have a trusted depth"
-        K = self._intrinsics.K
-        found = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, thresholds.reprojection_px, self._seed)
-        count = 0 if found is None else len(found[2])
-        if found is None or count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(points_known):
-            return f"only {count} of {len(points_known)} matches are inliers"
-        extent = pixels_known[found[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
+        if len(known) < thresholds.min_inliers:
+            return f"only {len(known)} matches have a trusted depth"
+        start = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, thresholds.reprojection_px, self._seed)
+        count = 0 if start is None else len(start[1])
+        if start is None or count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(known):
+            return f"only {count} of {len(known)} matches are inliers"
+        T_start, inliers = start
+        extent = pixels_known[inliers].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
             return f"{count} inliers in a small part of the image"
-        return Sighting(refine(points_known, pixels_known, K, found), float(np.median(points_known[found[2], 2])))
+        seen = resect([T_start], points_known[inliers], pixels_known[inliers], K)
+        return Sighting(seen.T_camera_world, seen.sigmas, known[inliers], float(np.median(points_known[inliers, 2])))
 
     def _sigmas(
-        self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: Sighting, backward: Sighting
+        self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: FloatArray, backward: FloatArray
     ) -> FloatArray:
         """Sigmas ``(6,)`` in camera b: of corners, of learned depth, and half the difference of both directions.
 
         Both directions use the same corners, whose errors are correlated: averaging does not reduce the sigmas.
         """
-        corners = _CORNER_SIGMA_WIDENING * np.hypot(forward.resection.sigmas, backward.resection.sigmas)
+        corners = _CORNER_SIGMA_WIDENING * np.hypot(forward, backward)
         rotation = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
         disagreement = np.concatenate([rotation, difference[:3, 3]]) / 2
         length_sigma = _LENGTH_RELATIVE_SIGMA * float(np.linalg.norm(T_a_b[:3, 3]))
-        floors = np.repeat(
-            [np.deg2rad(_ROTATION_FLOOR_DEG), np.hypot(_TRANSLATION_FLOOR_RATIO * depth, length_sigma)], 3
-        )
+        translation_floor = np.hypot(self.thresholds.translation_floor_ratio * depth, length_sigma)
+        floors = np.repeat([np.deg2rad(self.thresholds.rotation_floor_deg), translation_floor], 3)
         return np.asarray(np.linalg.norm([corners, disagreement, floors], axis=0))
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """Points resected in an image; ``depth`` is their median z-depth in the camera that measured them."""
-
-    resection: Resection
-    depth: float
-
-    @property
-    def T_image_points(self) -> FloatArray:
-        """Transform ``(4, 4)`` of the points to the camera of the image."""
-        return self.resection.T_camera_points
-
-    @property
-    def inliers(self) -> int:
-        """Number of inliers."""
-        return len(self.resection.inliers)
 
 
 def matches(first: View, second: View, thresholds: LoopThresholds) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -174,6 +242,19 @@ def matches(first: View, second: View, thresholds: LoopThresholds) -> tuple[NDAr
     distance[rows, nearest] = np.inf
     kept &= best < _RATIO * distance.min(axis=1)
     return rows[kept], nearest[kept]
+
+
+def _scale(
+    points_first: NDArray[np.float32], points_second: NDArray[np.float32], forward: Sighting, backward: Sighting
+) -> float | None:
+    """The unit of the second view in that of the first, by the depths of points that both have."""
+    both = np.intersect1d(forward.inliers, backward.inliers)
+    if len(both) < _LEAST_SCALES:
+        return None
+    seen_by_second = apply(forward.T_camera_points, points_first[both].astype(np.float64))[:, 2]
+    seen_by_first = apply(backward.T_camera_points, points_second[both].astype(np.float64))[:, 2]
+    ratios = np.median(seen_by_second / points_second[both, 2]), np.median(points_first[both, 2] / seen_by_first)
+    return float(np.sqrt(ratios[0] * ratios[1]))
 
 
 def _halfway(T_a_b: FloatArray, T_a_b_again: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.neighbours import neighbours_around
-from erfsfm.mvs.refine import Decide, RefinedDepth, Road, by_rules, measure
+from erfsfm.mvs.refine import Decide, RefinedDepth, measure
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert
@@ -26,9 +26,7 @@ def decision(config: DepthConfig) -> Decide | None:
     Raises:
         CheckpointError: ``config.fusion`` names no network that can be read.
     """
-    if config.refine == "learned":
-        return DepthFusion(config.fusion).decide
-    return by_rules if config.refine == "multiview" else None
+    return DepthFusion(config.fusion).decide if config.refine == "learned" else None
 
 
 class DepthRefiner:
@@ -40,7 +38,7 @@ class DepthRefiner:
         indices: Sequence[int],
         T_world_camera: FloatArray,
         image: Callable[[int], Image],
-        decide: Decide = by_rules,
+        decide: Decide,
     ) -> None:
         """Prepare.
 
@@ -57,7 +55,7 @@ class DepthRefiner:
         self._decide = decide
         self._appearance = lru_cache(maxsize=_REMEMBERED)(lambda n: _appearance(image(n)))
 
-    def refine(self, n: int, depth: DepthMap, road: Road | None) -> RefinedDepth | None:
+    def refine(self, n: int, depth: DepthMap) -> RefinedDepth | None:
         """The n-th keyframe's metric depth ``(H, W)``, refined; None where no neighbour is at a useful distance.
 
         Pixels without depth, as other sources than the networks may have, begin with that of the nearest pixel which
@@ -75,7 +73,7 @@ class DepthRefiner:
         T_neighbour_target = invert(self._T_world_camera[chosen]) @ self._T_world_camera[n]
         others = [self._appearance(k) for k in chosen]
         measurement = measure(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target)
-        refined = self._decide(measurement, road)
+        refined = self._decide(measurement)
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
         return refined
 

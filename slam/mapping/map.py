@@ -12,12 +12,11 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply
 from slam.frames import Intrinsics
-from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.geometry.se3 import FloatArray
 from slam.mapping.filters import DepthFilters, KeyframeDepth
-from slam.mapping.fusion import Fusion
-from slam.mapping.submap import BLOCK_VOXELS, SpilledSubmap, Submap
+from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
-from slam.mapping.views import ViewChooser
+from slam.mapping.views import ViewChooser, has_moved
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpillFile
 
@@ -42,23 +41,6 @@ class MapStatistics:
     floater_share: float
 
 
-@dataclass
-class _Stretch:
-    """The submap that grows."""
-
-    fusion: Fusion
-    frames: int = 0
-    length: float = 0.0
-    position: FloatArray | None = None
-
-    def add(self, position: FloatArray) -> None:
-        """Count a fused frame."""
-        if self.position is not None:
-            self.length += float(np.linalg.norm(position - self.position))
-        self.position = position
-        self.frames += 1
-
-
 class TsdfMap:
     """TSDF fusion of depth maps along a trajectory; lengths are in the trajectory's unit."""
 
@@ -71,9 +53,9 @@ class TsdfMap:
         self._views = ViewChooser(self._filters, config.depth_max_m)
         self._spill = SpillFile("the map")
         self._finished: list[SpilledSubmap] = []
+        self._growing: Fusion | None = None
         self._before: deque[KeyframeDepth] = deque(maxlen=_EARLIER)
         self._waiting: KeyframeDepth | None = None
-        self._stretch: _Stretch | None = None
         self._fused = self._left_out = 0
         self._surface: MapSurface | None = None
 
@@ -104,11 +86,13 @@ class TsdfMap:
             frames: frame numbers in time order.
             T_world_camera: poses of all frames ``(N, 4, 4)``.
         """
-        found: list[int] = []
+        chosen: list[int] = []
+        step_m = self._config.keyframe_distance_m
         for position, frame in enumerate(frames):
-            if not found or self._has_moved(T_world_camera[frame], T_world_camera[frames[found[-1]]]):
-                found.append(position)
-        return found
+            before = T_world_camera[frames[chosen[-1]]] if chosen else None
+            if before is None or has_moved(T_world_camera[frame], before, step_m, _KEYFRAME_ROTATION_DEG):
+                chosen.append(position)
+        return chosen
 
     def surface(self, progress: Progress = silent) -> MapSurface:
         """The surface of all that was fused; more depth maps may follow.
@@ -154,13 +138,6 @@ class TsdfMap:
         sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
         return MapStatistics(*sizes, *frames, self.voxel_size, filters, surface.floater_share)
 
-    def _has_moved(self, T_world_camera: FloatArray, T_world_previous: FloatArray) -> bool:
-        T_previous_camera = invert(T_world_previous) @ T_world_camera
-        moved = float(np.linalg.norm(T_previous_camera[:3, 3]))
-        turned = float(rotation_angle(T_previous_camera[:3, :3]))
-        config = self._config
-        return moved >= config.keyframe_distance_m or turned >= np.deg2rad(_KEYFRAME_ROTATION_DEG)
-
     def _fuse_waiting(self, following: KeyframeDepth | None) -> None:
         """Fuse the view that waits for the one after it."""
         if self._waiting is None:
@@ -173,25 +150,21 @@ class TsdfMap:
         """Filter and fuse a view, and begin a new submap where this one is long or large enough."""
         kept = self._filters.kept(view, others, next(iter(self._before), None))
         config = self._config
-        if self._stretch is None:
-            limits = config.truncation_voxels, config.reach_m
-            self._stretch = _Stretch(Fusion(config.voxel_size_m, *limits, self._intrinsics))
-        stretch = self._stretch
-        if not stretch.fusion.integrate(kept, view.T_world_camera):
+        if self._growing is None:
+            self._growing = Fusion(config.voxel_size_m, config.truncation_voxels, config.reach_m, self._intrinsics)
+        if not self._growing.integrate(kept, view.T_world_camera):
             return
         self._views.add(view, kept)
-        stretch.add(view.T_world_camera[:3, 3])
         self._fused += 1
         self._surface = None
-        is_large = stretch.fusion.blocks * _BLOCK_MB >= _FUSION_SHARE * config.memory_mb
-        if is_large or stretch.length >= config.submap_m:
+        is_large = self._growing.blocks * _BLOCK_MB >= _FUSION_SHARE * config.memory_mb
+        if is_large or self._growing.length >= config.submap_m:
             self._finish_submap()
 
     def _finish_submap(self) -> None:
         """Spill the submap that grows, if there is one."""
-        if self._stretch is None or not self._stretch.frames:
+        if self._growing is None or not self._growing.blocks:
             return
-        keys, observed, tsdf, weight = self._stretch.fusion.observed()
-        submap = Submap(keys, observed, tsdf, weight, **self._views.take(self._intrinsics))
+        submap = Submap(*self._growing.observed(), **self._views.take(self._intrinsics))
         self._finished.append(submap.spilled(self._spill))
-        self._stretch = None
+        self._growing = None

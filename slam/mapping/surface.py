@@ -20,11 +20,9 @@ from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
-from slam.mapping.colours import Painter
-from slam.mapping.holes import with_holes_closed
-from slam.mapping.merged_submaps import TILE_BLOCKS, MergedSubmaps
-from slam.mapping.submap import BLOCK_SIDE, SpilledSubmap
-from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile
+from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, MergedSubmaps, SpilledSubmap
+from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile, with_holes_closed
+from slam.mapping.views import Painter
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 

@@ -1,7 +1,8 @@
-"""The estimate of a drive: the trajectory that fits its measurements, and everything it was made from."""
+"""What is known of a drive before its pose graph, and the estimate that fits its measurements."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +21,27 @@ from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
 from slam.mapping.map import TsdfMap
 from slam.pipeline.positioning import Location
-from slam.runtime.storage.record import Missing
+from slam.runtime.attempt import Failed
 from slam.runtime.timing import Stopwatch
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """A completed drive, its factors in the unit of its scale, and ``T_world_camera`` ``(N, 4, 4)`` chained from them.
+
+    ``lidar_steps`` are the steps by LiDAR that agree with the images, ``agreements`` those of all sources.
+    """
+
+    drive: Drive
+    scale: Scale
+    factors: list[RelativePose]
+    T_world_camera: FloatArray
+    lidar_steps: Sequence[RelativePose]
+    agreements: Sequence[Agreement]
+
+    def views(self) -> list[View]:
+        """Those of the drive, their points in the unit of the trajectory."""
+        return [view.scaled(float(self.scale.per_frame[view.index])) for view in self.drive.views]
 
 
 @dataclass(frozen=True)
@@ -47,12 +67,12 @@ class Estimate:
     factors: list[RelativePose]
     views: list[View]
     loops: LoopClosures
-    graph: PoseGraph | Missing
+    graph: PoseGraph | Failed
     location: Location | MeasurementFailure | None
     stopwatch: Stopwatch
     confidence: float | MeasurementFailure
     support: FloatArray | None
-    agreements: tuple[Agreement, ...] = ()
+    agreements: Sequence[Agreement] = ()
     map: TsdfMap | None = None
 
     def places(self, intrinsics: Intrinsics) -> Places:

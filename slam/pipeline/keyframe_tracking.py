@@ -13,17 +13,17 @@ from erfsfm.common.threads import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
-from slam.frontend.keyframes.descriptors import describe
-from slam.frontend.keyframes.flow import new_corners
-from slam.frontend.keyframes.local_map import LocalMap
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.unit import learned_unit
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.tracking import new_corners
 from slam.geometry.se3 import FloatArray, invert
+from slam.loops.descriptors import describe
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
-from slam.pipeline.pending import height_of
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
@@ -76,6 +76,11 @@ class KeyframeTracking:
         self._cores.enter_context(opencv_threads(usable_cores()))
         self._odometry: KeyframeOdometry | None = KeyframeOdometry(config, intrinsics, seed, on_keyframe)
         self.choose(Drive())
+
+    @property
+    def _measuring(self) -> KeyframeOdometry | None:
+        """The keyframes where they measure the drive: not before the choice, nor on a vehicle."""
+        return self._odometry if self._front_end == "keyframes" else None
 
     @property
     def events(self) -> Sequence[TrackingEvent]:
@@ -134,17 +139,17 @@ class KeyframeTracking:
 
         A step measures it by a gap or a lost camera, and before the choice.
         """
-        if self._odometry is None or self._front_end == "both":
+        if self._measuring is None:
             return False
         by_steps = {motion.ends[1] for motion in drive.motions[-_LAST:]}
         is_doubtful = index in by_steps or not {index - 1, index}.isdisjoint(list(drive.unusable)[-_LAST:])
-        return not is_doubtful and self._odometry.locates(index - 1, index)
+        return not is_doubtful and self._measuring.locates(index - 1, index)
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
-        if self._odometry is None or self._front_end == "both" or not self._odometry.segments:
+        if self._measuring is None or not self._measuring.segments:
             return None
-        segment = self._odometry.segments[-1]
+        segment = self._measuring.segments[-1]
         placed = [(f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index]
         located = [(place, T_map) for place, T_map in placed if T_map is not None]
         if len(located) < 2 or located[-1][0] != index:
@@ -157,9 +162,9 @@ class KeyframeTracking:
     def maps(self, drive: Drive) -> tuple[MapSegment, ...]:
         """All parts of maps so far, each in one unit; none of a vehicle, nor before the choice."""
         self.choose(drive)
-        if self._odometry is None or self._front_end == "both":
+        if self._measuring is None:
             return ()
-        maps = [each.copy() for each in self._odometry.segments if each.started]
+        maps = [each.copy() for each in self._measuring.segments if each.started]
         return tuple(part for each in maps for part in parts_of(each, self._intrinsics))
 
 
@@ -183,3 +188,8 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
     if len(first) < _MOST_STEPS and not is_clear:
         return None
     return is_fast and scatter_deg < _VEHICLE_SCATTER_DEG
+
+
+def height_of(road: GroundPlane | MeasurementFailure) -> float | None:
+    """The camera's height over the ground plane of a frame, unscaled; None without one."""
+    return road.height_unscaled if isinstance(road, GroundPlane) else None

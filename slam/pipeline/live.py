@@ -10,27 +10,23 @@ import numpy as np
 
 from erfsfm.common.readers.camera_file import HIGHEST_M
 from erfsfm.common.readers.pinhole import impossible
-from erfsfm.inference import DepthPosePredictor
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
 from slam.loops.structure import PlaceStructure
-from slam.loops.thresholds import OF_KEYFRAMES
-from slam.pipeline.batch import SlamPipeline
+from slam.loops.verification import OF_KEYFRAMES
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.live_poses import LivePose, LivePoses
-from slam.pipeline.observer import Observer
-from slam.prediction.assembly import make_predictor, open_depth
+from slam.pipeline.run import Recorder, SlamPipeline
+from slam.prediction.assembly import open_prediction
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH
-from slam.runtime.storage.record import Missing
 from slam.runtime.threads import Turns, in_turn
-from slam.runtime.timing import Stopwatch
-from slam.sequences.growing import GrowingSequence
-from slam.sequences.recording import POSSIBLE_PERIODS_S
+from slam.sequences.recording import POSSIBLE_PERIODS_S, GrowingSequence
 
 
 class Slam:
@@ -83,7 +79,7 @@ class Slam:
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._pipeline = SlamPipeline(self._sequence, predictor, config, seed=seed)
         self._pipeline.require_possible()
-        self._observer = Observer(predictor, intrinsics, config, Stopwatch(), seed, camera_height_m)
+        self._observer = self._pipeline.observer()
         self._is_closed = False
         self._poses = LivePoses(predictor.sources, camera_height_m, config, update=update_frames)
         self._sweep_frames = sweep_frames
@@ -107,11 +103,8 @@ class Slam:
             ErfsfmError: as ``DepthPosePredictor.from_weights``.
         """
         _check(intrinsics, camera_height_m, config)
-        depth = (config or SlamConfig()).depth
-        source = open_depth(depth, intrinsics, None)
-        networks = DepthPosePredictor.from_weights(name_or_dir, device, "onnx")
-        predictor = make_predictor(networks, source, depth, intrinsics)
-        return cls(predictor, intrinsics, config, camera_height_m, with_map=with_map)
+        prediction = open_prediction(name_or_dir, device, (config or SlamConfig()).depth, intrinsics)
+        return cls(prediction.predictor, intrinsics, config, camera_height_m, with_map=with_map)
 
     def __len__(self) -> int:
         """Number of frames so far."""
@@ -202,7 +195,7 @@ class Slam:
         self._observer.flush()
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        estimate = self._pipeline.solve(self._observer.observations())
+        estimate = self._pipeline.solve(self._observer.observations(), Recorder())
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         self._estimate = estimate
         return estimate.loops
@@ -238,7 +231,7 @@ class Slam:
     def marginals(self, frame: int) -> FloatArray:
         """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`, or without one."""
         graph = self._solved().graph
-        if isinstance(graph, Missing):
+        if isinstance(graph, Failed):
             raise SlamError(graph.reason)
         return graph.marginal(frame)
 
@@ -249,7 +242,7 @@ class Slam:
         Raises:
             SlamError: the session was made without ``with_map``, or nothing was seen often enough.
         """
-        fused = self._pipeline.fuse(self._solved())
+        fused = self._pipeline.fuse(self._solved(), Recorder())
         if fused is None:
             raise SlamError("this session keeps no images: make Slam with with_map=True")
         with tempfile.TemporaryDirectory(prefix="erfsfm-slam-surface-") as folder:

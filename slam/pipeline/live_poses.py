@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from slam.config.sections import SlamConfig
 from slam.frontend.agreement import frame_support
-from slam.frontend.factors import chain_odometry, scaled_steps
+from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import resolve_mode
@@ -142,7 +143,7 @@ class LivePoses:
         # keyframes know all lengths but their unit, which learned depth of the ground gives
         roads_alone = replace(window, motions=[], road_steps={})
         window = roads_alone if by_keyframes else complete_drive(window, self._sources)
-        scale = find_scale(self._mode, self._camera_height_m, window, [], self._config.lengths)
+        scale = find_scale(self._mode, self._camera_height_m, window, [])
         self.unit_name = scale.unit_name
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
         if self._unit is None:
@@ -151,7 +152,7 @@ class LivePoses:
         self._unit = unit
         if by_keyframes:
             return
-        T_odometry = chain_odometry(scaled_steps(window, scale), len(window))
+        T_odometry = chain_odometry(make_factors(window, scale, logging.DEBUG), len(window))
         kept = max(first, self._settled)
         T_window_camera = T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])

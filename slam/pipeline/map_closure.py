@@ -13,17 +13,16 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
-from slam.frontend.keyframes.joining import SharedCorners, join
-from slam.frontend.keyframes.local_map import TrackedKeyframe
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.joining import join
+from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.scale.metric_scale import Scale
-from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.geometry.se3 import FloatArray, apply, invert, make, path_distance
 from slam.graph.similarity_graph import optimise_similarities
-from slam.loops.closure import LoopClosures
-from slam.loops.maps import MapLoop, find_map_loops
-from slam.loops.verification import Loop, RejectedLoop
+from slam.loops.closure import LoopClosures, find_loops, most_inliers_first
+from slam.loops.consistency import Track
+from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
 
 logger = logging.getLogger(__name__)
 
@@ -35,34 +34,32 @@ _LEAST_KEPT = 0.5
 # of neighbouring keyframes: rotation, translation over the step, logarithm of the scale
 _ROTATION_SIGMA, _RELATIVE_SIGMA, _SCALE_SIGMA = 0.005, 0.03, 0.02
 _LEAST_SIGMA = 1e-4
+_LOOP_SCALE_SIGMA = 0.05  # of the logarithm of the ratio of two units by a loop
+_TURN_SIGMAS = 3.0  # of a motion between parts of a map, by which a loop may correct it
 
 
 @dataclass(frozen=True)
 class MapClosure:
-    """Poses by the closed maps, their accepted ``loops``, the rejected ones, and the maps that were joined.
+    """Poses by the closed maps, the ``loops`` among their keyframes, and the maps that were joined.
 
     Lengths of loops are in the unit of their maps; ``learned_units`` is that of learned depth per unit of the map of
     each keyframe, before maps were joined, by its frame.
     """
 
     poses: KeyframePoses
-    loops: tuple[MapLoop, ...] = ()
-    rejected: tuple[RejectedLoop, ...] = ()
+    loops: LoopClosures = field(default_factory=LoopClosures)
     learned_units: Mapping[int, float] = field(default_factory=dict)
-    candidates: int = 0
-    measured: int = 0
     joins: tuple[TrackingEvent, ...] = ()
 
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
         scaled = scaled_poses(self.poses.loops, self.poses, scale)
-        accepted = (Loop(pose, loop.inliers, loop.score) for pose, loop in zip(scaled, self.loops, strict=True))
+        accepted = [replace(loop, measured=pose) for pose, loop in zip(scaled, self.loops.accepted, strict=True)]
         rejected = [
             loop.scaled(self.learned_units[loop.from_index] * float(scale.per_frame[loop.from_index]))
-            for loop in self.rejected
+            for loop in self.loops.rejected
         ]
-        rejected.sort(key=lambda r: (-r.inliers, -r.score, r.to_index, r.from_index))
-        return LoopClosures(self.candidates, self.measured, tuple(accepted), tuple(rejected))
+        return replace(self.loops, accepted=tuple(accepted), rejected=tuple(rejected))
 
 
 def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
@@ -74,64 +71,80 @@ def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Int
         intrinsics: of all images.
         seed: of RANSAC.
     """
-    rows = _Rows(maps)
-    found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, seed)
-    loops, rejected = list(found.found), list(found.rejected)
-    while loops:
+    rows = _Rows(maps, poses)
+    apart = rows.apart()
+    closures = find_loops(rows.views(), rows.track, apart.__getitem__, LoopVerifier(OF_KEYFRAMES, intrinsics, seed))
+    while closures.accepted:
+        loops = closures.accepted
         closed, wrong = _closed(rows, loops, intrinsics)
         if not wrong:
-            ends = [(rows.keyframes[loop.rows[0]].index, rows.keyframes[loop.rows[1]].index) for loop in loops]
-            poses = keyframe_poses(closed, intrinsics, seed, ends)
+            poses = keyframe_poses(closed, intrinsics, seed, [loop.ends for loop in loops])
             break
-        loops = [loop for loop in loops if loop not in wrong]
-        rejected += [rows.refused(loop, "its corners are not the same points after the adjustment") for loop in wrong]
-    joins = rows.joins(loops)
+        refused = [loop.refused("its corners are not the same points after the adjustment") for loop in wrong]
+        rejected = most_inliers_first([*closures.rejected, *refused])
+        closures = replace(closures, accepted=tuple(loop for loop in loops if loop not in wrong), rejected=rejected)
+    joins = rows.joins(closures.accepted)
     for joined in joins:
         logger.info("%s", joined)
-    counts = found.candidates, found.measured
-    return MapClosure(poses, tuple(loops), tuple(rejected), rows.learned_units(), *counts, joins)
+    return MapClosure(poses, closures, rows.learned_units(), joins)
 
 
 def views_of(keyframes: Sequence[TrackedKeyframe], points: FloatArray) -> list[View]:
     """Corners of keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
-    found = []
+    views = []
     for keyframe in keyframes:
-        own = apply(keyframe.T_camera_world, points[keyframe.track_ids]).astype(np.float32)
-        found.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, own))
-    return found
+        points_camera = apply(keyframe.T_camera_world, points[keyframe.track_ids]).astype(np.float32)
+        views.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, points_camera))
+    return views
 
 
 class _Rows:
     """The keyframes of all maps, row by row."""
 
-    def __init__(self, maps: Sequence[MapSegment]) -> None:
+    def __init__(self, maps: Sequence[MapSegment], poses: KeyframePoses) -> None:
         self.segments = maps
         self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
         counts = [len(segment.map.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
         self.T_map_camera = invert(np.array([k.T_camera_world for k in self.keyframes]).reshape(-1, 4, 4))
+        self.track = self._track(poses)
+
+    def _track(self, poses: KeyframePoses) -> Track:
+        """Where odometry has the keyframes: parts of a map are related by the motions between them."""
+        frames = np.array([keyframe.index for keyframe in self.keyframes], np.intp)
+        alone = zip(frames.tolist(), (-1 - self.maps).tolist(), strict=True)
+        worlds = np.array([poses.linked.get(frame, world) for frame, world in alone], np.intp)
+        related = worlds >= 0
+        T = self.T_map_camera.copy()
+        T[related] = np.array([poses.T_map_camera[k] for k in frames[related].tolist()]).reshape(-1, 4, 4)
+        path = path_distance(T)
+        for pose in poses.poses:
+            if poses.segments[pose.from_index] != poses.segments.get(pose.to_index):
+                unsure = _TURN_SIGMAS * float(np.linalg.norm(pose.sigmas[3:]))
+                path[frames >= pose.to_index] += unsure / OF_KEYFRAMES.max_drift_ratio
+        return Track(T, path, frames, self.maps, worlds)
+
+    def of(self, loop: Loop) -> tuple[int, int]:
+        """Rows of the keyframes of a loop."""
+        earlier, later = self.track.rows([loop])[0].tolist()
+        return earlier, later
 
     def views(self) -> list[View]:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
-        found = []
+        views = []
         for segment in self.segments:
             settled = segment.map.parallax().settled[:, None]
-            found += views_of(segment.map.keyframes, np.where(settled, segment.map.points, np.nan))
-        return found
+            views += views_of(segment.map.keyframes, np.where(settled, segment.map.points, np.nan))
+        return views
 
     def apart(self) -> NDArray[np.bool_]:
         """Which keyframes share few tracks ``(K, K)``."""
         first = np.cumsum([0, *(len(segment.map.points) for segment in self.segments)])
         tracks = [k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)]
-        of_row = np.repeat(np.arange(len(tracks)), [len(each) for each in tracks])
+        of_row = np.repeat(np.arange(len(tracks)), [len(of_keyframe) for of_keyframe in tracks])
         shape = len(tracks), int(first[-1])
         seen = csr_array((np.ones(len(of_row)), (of_row, np.concatenate(tracks))), shape=shape)
         return np.asarray((seen @ seen.T).toarray() < _CONNECTED)
-
-    def refused(self, loop: MapLoop, reason: str) -> RejectedLoop:
-        """A loop rejected after all."""
-        first, last = (self.keyframes[row].index for row in loop.rows)
-        return RejectedLoop(first, last, reason, loop.score, loop.inliers, loop.similarity.T_from_to)
 
     def learned_units(self) -> dict[int, float]:
         """The unit of learned depth per unit of each keyframe's map, by its frame."""
@@ -140,28 +153,27 @@ class _Rows:
             units |= dict.fromkeys((keyframe.index for keyframe in segment.map.keyframes), learned_unit(segment.map))
         return units
 
-    def joins(self, loops: Sequence[MapLoop]) -> tuple[TrackingEvent, ...]:
+    def joins(self, loops: Sequence[Loop]) -> tuple[TrackingEvent, ...]:
         """Each map after the first that loops join with an earlier one."""
-        found = []
+        events = []
         for number, segment in enumerate(self.segments):
-            rows = [loop.rows for loop in loops if self.maps[loop.rows[1]] == number != self.maps[loop.rows[0]]]
-            joining = [self.keyframes[row].index for row, _ in rows]
+            rows = [(earlier, later) for earlier, later in map(self.of, loops) if self.maps[earlier] != number]
+            joining = [self.keyframes[earlier].index for earlier, later in rows if self.maps[later] == number]
             if joining:
                 first = segment.map.keyframes[0].index
-                found.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
-        return tuple(found)
+                events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
+        return tuple(events)
 
-    def start(self, loops: Sequence[MapLoop], members: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    def start(self, loops: Sequence[Loop], members: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
         """Poses ``(K, 4, 4)`` and units ``(K,)`` of all keyframes in the world of the first of some joined maps."""
         T, scales = self.T_map_camera.copy(), np.ones(len(self.keyframes))
         done = {int(members[0])}
-        across = [loop for loop in loops if len(set(self.maps[list(loop.rows)])) == 2]
+        across = [loop for loop in loops if len(set(self.maps[list(self.of(loop))])) == 2]
         across.sort(key=lambda loop: -loop.inliers)
         while len(done) < len(members):
-            loop = next(loop for loop in across if len(done & set(self.maps[list(loop.rows)].tolist())) == 1)
-            known, new = loop.rows
-            similarity = loop.similarity
-            T_known_new, scale = similarity.T_from_to, similarity.scale
+            loop = next(loop for loop in across if len(done & set(self.maps[list(self.of(loop))].tolist())) == 1)
+            known, new = self.of(loop)
+            T_known_new, scale = loop.measured.T_from_to, loop.scale
             if int(self.maps[known]) not in done:
                 known, new = new, known
                 T_known_new, scale = invert(T_known_new), 1.0 / scale
@@ -169,23 +181,22 @@ class _Rows:
             number = int(self.maps[new])
             scales[self.maps == number] = scale * scales[known]
             T_step = make(T_known_new[:3, :3], scales[known] * T_known_new[:3, 3])
-            T_new_each = invert(self.T_map_camera[new]) @ self.T_map_camera[self.maps == number]
-            T_new_each[:, :3, 3] *= scales[new]
-            T[self.maps == number] = T[known] @ T_step @ T_new_each
+            T_new_member = invert(self.T_map_camera[new]) @ self.T_map_camera[self.maps == number]
+            T_new_member[:, :3, 3] *= scales[new]
+            T[self.maps == number] = T[known] @ T_step @ T_new_member
             done.add(number)
         return T, scales
 
 
-def _closed(rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics) -> tuple[list[MapSegment], list[MapLoop]]:
+def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple[list[MapSegment], list[Loop]]:
     """The maps after these loops, and the loops that the adjustment contradicts."""
-    count = len(rows.segments)
-    ends = rows.maps[np.array([loop.rows for loop in loops], np.intp).reshape(-1, 2)]
+    count, ends = len(rows.segments), rows.maps[rows.track.rows(loops)]
     links = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, group = connected_components(links, directed=False)
     closed, wrong = [], []
     for number in np.unique(group):
         members = np.flatnonzero(group == number)
-        inside = [loop for loop in loops if group[rows.maps[loop.rows[0]]] == number]
+        inside = [loop for loop, (earlier, _) in zip(loops, ends, strict=True) if group[earlier] == number]
         if not inside:
             closed += [rows.segments[member] for member in members]
             continue
@@ -196,19 +207,18 @@ def _closed(rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics) -> tu
 
 
 def _joined(
-    rows: _Rows, loops: Sequence[MapLoop], members: NDArray[np.intp], intrinsics: Intrinsics
+    rows: _Rows, loops: Sequence[Loop], members: NDArray[np.intp], intrinsics: Intrinsics
 ) -> tuple[MapSegment, list[float]]:
     T, scales = rows.start(loops, members)
     chosen = np.flatnonzero(np.isin(rows.maps, members))
     place = np.full(len(rows.keyframes), -1)
     place[chosen] = np.arange(len(chosen))
-    edges = _steps(rows, chosen)
-    edges += [
-        replace(loop.similarity, from_index=int(place[loop.rows[0]]), to_index=int(place[loop.rows[1]]))
-        for loop in loops
-    ]
+    edges, shared = _steps(rows, chosen), []
+    for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
+        sigmas = np.append(loop.measured.sigmas, _LOOP_SCALE_SIGMA)
+        edges.append(RelativeSimilarity(earlier, later, loop.measured.T_from_to, loop.scale, sigmas))
+        shared.append((earlier, later, loop.corners))
     T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
-    shared = [SharedCorners(int(place[loop.rows[0]]), int(place[loop.rows[1]]), loop.corners) for loop in loops]
     return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)
 
 

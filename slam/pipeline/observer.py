@@ -3,45 +3,79 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
 import numpy as np
 
-from erfsfm.common.errors import COUNTED
+from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
+from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.image_gate import ImageGate, Verdict
+from slam.frontend.image_gate import GateState, ImageGate, Verdict
+from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.odometry import VisualOdometry
+from slam.frontend.visual.odometry import OdometryState, VisualOdometry
 from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
-from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.observations import Observations
-from slam.pipeline.pending import (
-    PendingFrame,
-    PendingTask,
-    RecentFrame,
-    has_moved_on,
-    height_of,
-    last_step,
-    predicted_depth,
-)
-from slam.runtime.errors import MissingFrameError, SequenceError
-from slam.runtime.memory import return_freed_memory
+from slam.pipeline.keyframe_tracking import KeyframeTracking, height_of
+from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
 from slam.runtime.storage.spill import SpillFile
-from slam.runtime.timing import Stopwatch
+from slam.runtime.timing import Stopwatch, return_freed_memory
 
 logger = logging.getLogger(__name__)
+
 _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
+_MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
+_LAST_STEPS = 4
+_LAST_ROADS = 8  # looked back for the camera's height, frames
+
+
+@dataclass(frozen=True)
+class Observations:
+    """All measurements up to a frame, which stay while others follow.
+
+    ``maps`` are those of keyframes, none of a drive that is measured by steps alone, and ``events`` what became of
+    them.
+    """
+
+    drive: Drive
+    gate: GateState
+    odometry: OdometryState
+    maps: tuple[MapSegment, ...]
+    events: list[TrackingEvent]
+
+
+@dataclass
+class FrameInWork:
+    """A frame, what the networks were asked of it (None: nothing), and its pixels ``standing`` that show no world.
+
+    Its ``depth`` ``(H, W)`` and the camera's ``height``, unscaled, are None until they are known.
+    """
+
+    frame: Frame
+    prediction: Future[DepthMap] | None
+    snippet: Future[SnippetPoses] | None
+    standing: Mask | None
+    depth: DepthMap | None = None
+    height: float | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """Work of another thread, the stage that waits for it, and what to do with its ``result``."""
+
+    stage: str
+    result: Future[Any]
+    keep: Callable[[Any], None]
 
 
 class Observer:
@@ -74,28 +108,28 @@ class Observer:
             seed: of all RANSAC draws.
             camera_height_m: above the road; None where unknown.
         """
-        self._predictor = predictor
-        self._config = config
+        self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
         self._baseline = config.visual_odometry.rotation_baseline_steps
-        self._stopwatch = stopwatch
-        self._drive = Drive()
+        self.drive = Drive()  # the measurements so far
         self._gate = ImageGate()
         self._odometry = VisualOdometry(config.visual_odometry, intrinsics, seed)
-        parts = config.keyframes, config.loops, intrinsics, seed, camera_height_m
-        self._keyframes = KeyframeTracking(*parts, self._predict_depth)
-        self._road = RoadHomography(config.road, intrinsics)
-        self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
+        self._keyframes = KeyframeTracking(
+            config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
+        )
+        self._road = RoadHomography(intrinsics)
+        self._plane = GroundPlaneFitter(intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
         self._snippet_frames: tuple[Frame, ...] = ()
-        self._recent: tuple[RecentFrame, ...] = ()
+        self._recent: tuple[FrameInWork, ...] = ()
         self._unread = 0  # frames in a row whose image cannot be read
+        self._failed = 0  # and whose measurement failed
         self._depth_index = -1  # the last frame whose depth was asked for
         self._spill_file = SpillFile()
         self._networks = predictor.executor()
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="beside")
-        self._pending: PendingFrame | None = None
-        self._depth: Future[DepthMap] | None = None  # of the frame that is processed
-        self._tasks: list[PendingTask] = []
+        self._pending: FrameInWork | None = None
+        self._current: FrameInWork | None = None
+        self._tasks: list[Task] = []
 
     def __enter__(self) -> Self:
         return self
@@ -127,36 +161,31 @@ class Observer:
         if isinstance(verdict, MeasurementFailure):
             self._leave_out(index, verdict.reason)
             return
-        pending = self._submit_networks(frame)
+        asked = self._ask_networks(frame)
         try:
-            self._process_pending()
+            self._measure_pending()
         finally:
-            self._pending = pending
+            self._pending = asked
             if verdict == "repeated":  # what is measured of the frame before does not know it
-                self._drive.repeat(index, self._gate.was_moving)
+                self.drive.repeat(index, self._gate.was_moving)
 
     def flush(self) -> None:
         """Finish every frame so far."""
-        self._process_pending()
+        self._measure_pending()
         while self._tasks:
-            self._finish_tasks()
+            self._measure(len(self.drive) - 1, self._finish_tasks)
 
     def observations(self) -> Observations:
         """All measurements so far; more frames may follow."""
         self.flush()
-        maps = self._keyframes.maps(self._drive)
+        maps = self._keyframes.maps(self.drive)
         events = list(self._keyframes.events)
-        return Observations(self._drive.copy(), self._gate.state, self._odometry.state, maps, events)
+        return Observations(self.drive.copy(), self._gate.state, self._odometry.state, maps, events)
 
     @property
     def frames(self) -> int:
         """Number of frames so far."""
-        return len(self._drive) + (self._pending is not None)
-
-    @property
-    def drive(self) -> Drive:
-        """The measurements so far, which grow with the frames."""
-        return self._drive
+        return len(self.drive) + (self._pending is not None)
 
     def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:
         """As `KeyframeTracking.step`, of a finished frame."""
@@ -167,135 +196,165 @@ class Observer:
         if isinstance(error, MissingFrameError) and self._config.gaps.enabled:
             return
         self._unread += 1
-        if not self._config.gaps.enabled or self._unread > self._config.gaps.max_unread_frames:
+        if not self._is_gap(self._unread):
             raise error
+
+    def _is_gap(self, frames: int) -> bool:
+        """Whether so many frames in a row may be without a measurement."""
+        return self._config.gaps.enabled and frames <= self._config.gaps.max_unread_frames
 
     def _leave_out(self, index: int, reason: str) -> None:
         try:
-            self._process_pending()
+            self._measure_pending()
         finally:  # the error is of the frame before
-            self._drive.unusable[index] = reason
-            self._drive.roads.append(MeasurementFailure(reason))
+            self.drive.unusable[index] = reason
+            self.drive.roads.append(MeasurementFailure(reason))
             self._snippet_frames = ()
 
-    def _submit_networks(self, frame: Frame) -> PendingFrame:
-        sources, index, stride = self._predictor.sources, frame.index, self._config.depth.predicted_stride
+    def _ask_networks(self, frame: Frame) -> FrameInWork:
+        """Submit what is wanted of a frame: the one place that decides what the networks predict."""
+        sources, index, drive = self._predictor.sources, frame.index, self.drive
+        stride = self._config.depth.predicted_stride
         is_first = len(self._snippet_frames) == sources  # since a gap
         self._snippet_frames = (*self._snippet_frames, frame)[-sources - 1 :]
         # what was measured two frames ago is finished, whatever else is
-        by_keyframes, step = self._keyframes.measures(self._drive, index - 2), last_step(self._drive, index - 2)
+        by_keyframes, step = self._keyframes.measures(drive, index - 2), self._last_step(index - 2)
+        has_moved = step is not None and self._has_moved_on(step, index + 1 - self._depth_index)
+        after_frozen = drive.repeated[-1:] == [index - 1]  # what it hid is not carried
+        wants_depth = not by_keyframes and (step is None or has_moved or index % stride == 0 or after_frozen)
         is_dense = not by_keyframes and (step is None or stride == 1)
-        far = step is not None and has_moved_on(self._drive, step, index + 1 - self._depth_index)
-        after_frozen = self._drive.repeated[-1:] == [index - 1]  # what it hid is not carried
-        is_seen = not by_keyframes and (step is None or far or index % stride == 0 or after_frozen)
-        depth = snippet = None
-        if is_seen:
-            self._depth_index, depth = index, self._networks.submit(predicted_depth, self._predictor, frame)
-        if len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0):
-            snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
-        return PendingFrame(frame, depth, snippet, self._gate.state.standing)
+        wants_snippet = len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0)
+        asked = FrameInWork(frame, None, None, self._gate.state.standing)
+        if wants_depth:
+            self._depth_index, asked.prediction = index, self._predict(frame)
+        if wants_snippet:
+            asked.snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
+        return asked
 
-    def _process_pending(self) -> None:
+    def _last_step(self, index: int) -> Motion | None:
+        """The step to one of the last frames, where image geometry measured it."""
+        return next((motion for motion in self.drive.motions[-_LAST_STEPS:] if motion.ends[1] == index), None)
+
+    def _has_moved_on(self, step: Motion, frames: int) -> bool:
+        """Whether so many more steps as this one leave what the last predicted depth shows."""
+        roads = self.drive.roads[: step.ends[1] + 1][-_LAST_ROADS:]
+        height = next((height for road in reversed(roads) if (height := height_of(road)) is not None), math.inf)
+        return frames * step.length_unscaled > _MOVED_ON_HEIGHTS * height
+
+    def _predict(self, frame: Frame) -> Future[DepthMap]:
+        return self._networks.submit(predicted_depth, self._predictor, frame)
+
+    def _ask_depth(self, keyframe: Frame) -> None:
+        """Predict the depth of a keyframe while it is adjusted, unless it was asked for before."""
+        if self._current is not None and self._current.prediction is None:
+            self._current.prediction = self._predict(keyframe)
+
+    def _measure_pending(self) -> None:
         """All measurements but the networks' of the pending frame."""
         pending, self._pending = self._pending, None
         if pending is None:
             return
+        self._measure(pending.frame.index, partial(self._stages, pending))
+
+    def _measure(self, index: int, compute: Callable[[], None]) -> None:
+        """Compute what is measured of a frame, which is a gap after an error that nobody foresaw.
+
+        Known errors are for the user to mend; too many in a row are not of single frames.
+        """
         try:
-            self._process(pending)
+            compute()
         except Exception as error:
-            # callers may continue after this: the frame becomes a gap, with one entry in ``roads`` as all frames
             self._tasks.clear()
             self._recent = ()
-            self._drive.unusable[pending.frame.index] = f"it could not be measured ({error})"
-            if len(self._drive) == pending.frame.index:
-                self._drive.roads.append(MeasurementFailure(str(error)))
-            raise
+            reason = f"it could not be measured: {explained(error)}"
+            self.drive.unusable[index] = reason
+            if len(self.drive) == index:  # one entry in ``roads`` as all frames
+                self.drive.roads.append(MeasurementFailure(reason))
+            self._failed += 1
+            is_known = isinstance(error, OneLineError | OSError | MemoryError)
+            if is_known or shows_traceback() or not self._is_gap(self._failed):
+                raise
+            logger.warning("frame %d is a gap: %s", index, reason)
+        else:
+            self._failed = 0
 
-    def _process(self, pending: PendingFrame) -> None:
-        frame, self._depth = pending.frame, pending.depth
+    def _stages(self, current: FrameInWork) -> None:
+        """The stages of a frame; the tasks that they leave to other threads end with the next frame."""
+        self._current, was_asked = current, current.prediction is not None
+        previous, drive = self._recent[-1] if self._recent else None, self.drive
         self._finish_tasks("depth network")  # of a keyframe, whose points depend on it
         with self._stopwatch.stage("keyframes"):
-            self._keyframes.follow(frame)
+            self._keyframes.follow(current.frame)
         with self._stopwatch.stage("geometry"):
-            measure = self._config.visual_odometry.enabled and not self._keyframes.measures(self._drive, frame.index)
-            step = self._measure_step(self._recent[-1], pending) if measure and self._recent else None
-            rotation = self._relative_rotation(frame)
+            step = self._step(previous, current)
+            rotation = self._relative_rotation(current.frame)
         self._finish_tasks()
-        self._keyframes.choose(self._drive)
-        if pending.snippet is not None:
-            self._tasks.append(PendingTask("pose network", pending.snippet, self._keep_snippet))
+        self._keyframes.choose(drive)
+        drive.roads.append(MeasurementFailure("its depth was not predicted"))
+        self._recent = (*self._recent, current)[-self._baseline :]
+        if current.snippet is not None:
+            self._tasks.append(Task("pose network", current.snippet, self._keep_snippet))
         if rotation is not None:
-            self._tasks.append(PendingTask("geometry", self._beside.submit(rotation), self._keep_rotation))
-        if self._config.road.enabled and step is not None:
-            self._tasks.append(self._road_task(self._recent[-1].frame, pending, step))
-        self._drive.roads.append(MeasurementFailure("its depth was not predicted"))
-        self._recent = (*self._recent, RecentFrame(frame, None, None))[-self._baseline :]
-        if pending.depth is not None:
-            with self._stopwatch.stage("depth network"):
-                depth = pending.depth.result()
-            self._learn(pending, depth)
-        elif self._depth is not None:  # of a keyframe
-            self._tasks.append(PendingTask("depth network", self._depth, partial(self._learn, pending)))
+            self._tasks.append(Task("geometry", self._beside.submit(rotation), self._keep_rotation))
+        if step is not None and previous is not None and self._config.road.enabled:
+            self._tasks.append(self._road_task(previous.frame, current, step))
+        if current.prediction is not None:
+            self._tasks.append(Task("depth network", current.prediction, partial(self._learn, current)))
+        if was_asked:  # that of a keyframe comes while it is adjusted
+            self._finish_tasks("depth network")
 
-    def _predict_depth(self, keyframe: Frame) -> None:
-        """Predict the depth of a keyframe while it is adjusted, unless it was asked for before."""
-        self._depth = self._depth or self._networks.submit(predicted_depth, self._predictor, keyframe)
-
-    def _learn(self, pending: PendingFrame, depth: DepthMap) -> None:
+    def _learn(self, current: FrameInWork, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
-        frame, depth = pending.frame, pending.visible(depth)
+        frame, error = current.frame, self._odometry.state.depth_error
+        if current.standing is not None:
+            depth = np.where(resized_mask(current.standing, *depth.shape[::-1]), np.float32(0), depth)
         with self._stopwatch.stage("road"):
-            self._drive.roads[frame.index] = road = self._plane.fit(depth, self._odometry.state.depth_error)
+            self.drive.roads[frame.index] = road = self._plane.fit(depth, error)
         self._keyframes.learn(frame, depth)
-        height = self._remember(frame, depth, height_of(road))
-        views, loops = self._drive.views, self._config.loops
+        current.depth, current.height = depth, height_of(road)
+        views, loops = self.drive.views, self._config.loops
         if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
             with self._stopwatch.stage("loops"):
-                view = self._features.view(frame, depth, height)
+                view = self._features.view(frame, depth, current.height)
                 learned = view.points[:, 2].astype(np.float64)
-                views.append(view.scaled(self._odometry.state.depth_error.corrected(learned) / learned))
-        self._keep(frame, depth)
+                views.append(view.scaled(error.corrected(learned) / learned))
+        self._keep_for_map(frame, depth)
 
-    def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:
-        """Depth and camera height, predicted late where nobody asked for them before."""
-        if recent.depth is not None:
-            return recent.depth, recent.height
-        carried = self._carried(recent)
-        if carried is not None:
-            return carried
-        depth = self._networks.submit(predicted_depth, self._predictor, recent.frame).result()
-        road = self._plane.fit(depth, self._odometry.state.depth_error)
-        return depth, self._remember(recent.frame, depth, height_of(road))
+    def _depth_of(self, recent: FrameInWork) -> DepthMap:
+        """Depth ``(H, W)`` of a recent frame: carried from the frame before where it was not predicted, else late."""
+        if recent.depth is None and not self._carry(recent):
+            recent.depth = self._predict(recent.frame).result()
+            recent.height = height_of(self._plane.fit(recent.depth, self._odometry.state.depth_error))
+        assert recent.depth is not None
+        return recent.depth
 
-    def _carried(self, recent: RecentFrame) -> tuple[DepthMap, float | None] | None:
-        """Depth of the frame before a recent one, moved with the camera, and its height; None where one is unknown."""
-        step = last_step(self._drive, recent.frame.index)
+    def _carry(self, recent: FrameInWork) -> bool:
+        """Give a frame the depth of the frame before, moved with the camera; whether that is known."""
+        step = self._last_step(recent.frame.index)
         before = next((r for r in self._recent if step is not None and r.frame.index == step.ends[0]), None)
         if step is None or before is None or before.depth is None:
-            return None
+            return False
         depth = self._odometry.carried(before.depth, step)
         if depth is None:
+            return False
+        self._keep_for_map(recent.frame, depth)
+        recent.depth, recent.height = depth, before.height
+        return True
+
+    def _step(self, previous: FrameInWork | None, current: FrameInWork) -> Motion | None:
+        """The motion from the frame before; None where keyframes measure it, it failed or triangulated no point."""
+        wanted = self._config.visual_odometry.enabled and not self._keyframes.measures(self.drive, current.frame.index)
+        if previous is None or not wanted:
             return None
-        self._keep(recent.frame, depth)
-        return depth, self._remember(recent.frame, depth, before.height)
-
-    def _remember(self, frame: Frame, depth: DepthMap, height: float | None) -> float | None:
-        """Keep the depth of a recent frame and its camera height, which is returned."""
-        self._recent = tuple(replace(r, depth=depth, height=height) if r.frame is frame else r for r in self._recent)
-        return height
-
-    def _measure_step(self, previous: RecentFrame, pending: PendingFrame) -> Motion | None:
-        """The motion from the frame before; None where it could not be measured or triangulated no point."""
-        depth, height = self._known(previous)
-        current = pending.frame
-        measured = self._odometry.measure(previous.frame, current, depth, height, pending.standing)
+        depth = self._depth_of(previous)
+        measured = self._odometry.measure(previous.frame, current.frame, depth, previous.height, current.standing)
         if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
             measured = MeasurementFailure(_NO_POSE)
         if isinstance(measured, MeasurementFailure):
-            self._drive.failures.append((previous.frame.index, current.index, measured.reason))
-            logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.index, measured.reason)
+            self.drive.failures.append((previous.frame.index, current.frame.index, measured.reason))
+            logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.frame.index, measured.reason)
             return None
-        self._drive.motions.append(measured)
+        self.drive.motions.append(measured)
         return measured if measured.is_triangulated else None
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
@@ -303,33 +362,42 @@ class Observer:
         if self._baseline < 2 or len(self._recent) < self._baseline:
             return None
         first = self._recent[-self._baseline]
-        motions = {m.ends: m for m in self._drive.motions[-2 * self._baseline :] if m.is_triangulated}
+        motions = {m.ends: m for m in self.drive.motions[-2 * self._baseline :] if m.is_triangulated}
         path = path_between(shortest_by_start(motions), first.frame.index, current.index)
         if path is None or len(path) != self._baseline:
             return None
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
-        return self._odometry.relative_rotation(first.frame, current, self._known(first)[0], T_first_current)
+        return self._odometry.relative_rotation(first.frame, current, self._depth_of(first), T_first_current)
 
-    def _keep_snippet(self, snippet: SnippetPoses) -> None:
-        if is_se3(snippet.T_source_target):
-            self._drive.snippets.append(snippet)
-        else:
-            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE, extra=COUNTED)
-
-    def _keep_rotation(self, rotation: Any) -> None:
-        if rotation is not None:
-            self._drive.relative_rotations.append(rotation)
-
-    def _road_task(self, previous: Frame, pending: PendingFrame, motion: Motion) -> PendingTask:
+    def _road_task(self, previous: Frame, current: FrameInWork, motion: Motion) -> Task:
         def keep(step: RoadStep | MeasurementFailure) -> None:
             if isinstance(step, RoadStep):
-                self._drive.road_steps[motion.ends] = step
+                self.drive.road_steps[motion.ends] = step
             else:
                 logger.info("road %d -> %d failed: %s", *motion.ends, step.reason)
 
-        frames, T_previous_current = (previous, pending.frame), motion.relative_pose.T_from_to
-        measured = self._beside.submit(self._road.measure, *frames, T_previous_current, pending.standing)
-        return PendingTask("road", measured, keep)
+        T_previous_current = motion.relative_pose.T_from_to
+        measured = self._beside.submit(
+            self._road.measure, previous, current.frame, T_previous_current, current.standing
+        )
+        return Task("road", measured, keep)
+
+    def _keep_snippet(self, snippet: SnippetPoses) -> None:
+        if is_se3(snippet.T_source_target):
+            self.drive.snippets.append(snippet)
+        else:
+            logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE)
+
+    def _keep_rotation(self, rotation: Any) -> None:
+        if rotation is not None:
+            self.drive.relative_rotations.append(rotation)
+
+    def _keep_for_map(self, frame: Frame, depth: DepthMap) -> None:
+        """Keep a thinned frame for the map."""
+        mapping = self._config.mapping
+        if mapping.enabled and frame.index % mapping.frame_stride == 0:
+            keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
+            self._tasks.append(Task("map", keyframe, self.drive.keyframes.append))
 
     def _finish_tasks(self, stage: str | None = None) -> None:
         """Wait for the tasks of the last frame, or for those of one stage alone."""
@@ -337,11 +405,18 @@ class Observer:
         self._tasks = [task for task in self._tasks if task not in tasks]  # so that a failed one is not raised again
         for task in tasks:
             with self._stopwatch.stage(task.stage):
-                task.keep(task.result.result())
+                result = task.result.result()
+            task.keep(result)
 
-    def _keep(self, frame: Frame, depth: DepthMap) -> None:
-        """Keep a thinned frame for the map."""
-        mapping = self._config.mapping
-        if mapping.enabled and frame.index % mapping.frame_stride == 0:
-            keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
-            self._tasks.append(PendingTask("map", keyframe, self._drive.keyframes.append))
+
+def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:
+    """Depth ``(H, W)`` of a frame.
+
+    Raises:
+        SlamError: a user's predictor gives something else.
+    """
+    depth = predictor.depth(frame)
+    wanted, shape, kind = frame.image.shape[:2], np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
+    if shape != wanted or kind != np.float32:
+        raise SlamError(f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}")
+    return depth

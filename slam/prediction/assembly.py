@@ -1,16 +1,77 @@
-"""The predictor of a run, assembled from networks and the source of depth."""
+"""The predictor of a run: the trained networks, with depth from elsewhere where that is wanted."""
 
 from __future__ import annotations
 
-from erfsfm.inference import DepthPosePredictor
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.inference import DepthPosePredictor, depth_at, limit_torch_threads
 from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
-from slam.frames import Intrinsics, Predictor
+from slam.frames import DepthMap, Frame, Image, Intrinsics, Predictor, SnippetPoses
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers, Undistort
 from slam.prediction.depth_source import DepthSource, SourcedPredictor
-from slam.prediction.networks import NetworkPredictor
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_plug_in, plug_ins
+
+
+class Networks(Protocol):
+    """Interface of the networks (``erfsfm.inference.DepthPosePredictor``); each image is prepared once."""
+
+    sources: int
+
+    def prepare(self, image: Image) -> Any:
+        """An image as input of the networks."""
+
+    def disparity(self, image: Any) -> NDArray[np.float32]:
+        """Unscaled 1/depth ``(h, w)`` of a prepared image, at the networks' own size."""
+
+    def poses(self, images: Sequence[Any]) -> NDArray[np.float64]:
+        """``T_source_target`` ``(N, 4, 4)`` of N + 1 prepared images in time order, the target in the middle."""
+
+
+class NetworkPredictor:
+    """Depth and snippet poses of the frames of one sequence, by the networks."""
+
+    def __init__(self, networks: Networks, intrinsics: Intrinsics) -> None:
+        """Predict for the frames of one sequence.
+
+        Args:
+            networks: depth and pose network.
+            intrinsics: of all images.
+        """
+        self._networks = networks
+        self._intrinsics = intrinsics
+        self._key = object()  # key of outputs kept in frames, which outlive the networks
+        self.sources = networks.sources
+
+    def executor(self) -> Executor:
+        """One thread, in which torch leaves a core to the other threads."""
+        return ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks", initializer=limit_torch_threads)
+
+    def depth(self, frame: Frame) -> DepthMap:
+        """Unscaled z-depth ``(H, W)`` at the image's size."""
+        height, width = frame.image.shape[:2]
+        return depth_at(self._disparity(frame), height, width)
+
+    def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
+        """Poses of the sources of a snippet; the target is the middle frame."""
+        T_source_target = self._networks.poses([self._prepared(frame) for frame in frames])
+        middle = self.sources // 2
+        sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
+        return SnippetPoses(frames[middle].index, sources, T_source_target)
+
+    def _disparity(self, frame: Frame) -> NDArray[np.float32]:
+        return frame.derived((self._key, "disparity"), lambda: self._networks.disparity(self._prepared(frame)))
+
+    def _prepared(self, frame: Frame) -> Any:
+        return frame.derived((self._key, "prepared"), lambda: self._networks.prepare(frame.image))
 
 
 def open_depth(
@@ -43,9 +104,30 @@ def open_depth(
     return DepthFolder(config, numbers, intrinsics.width, intrinsics.height, undistort)
 
 
-def make_predictor(
-    networks: DepthPosePredictor, source: DepthSource | None, config: DepthConfig, intrinsics: Intrinsics
-) -> Predictor:
-    """The networks, with depth by ``source`` where there is one."""
+@dataclass(frozen=True)
+class Prediction:
+    """Networks, the source of depth where that is another, and both as the predictor of a run."""
+
+    networks: DepthPosePredictor
+    source: DepthSource | None
+    predictor: Predictor
+
+
+def open_prediction(
+    weights: str | Path,
+    device: str,
+    depth: DepthConfig,
+    intrinsics: Intrinsics,
+    numbers: FrameNumbers | None = None,
+    undistort: Undistort | None = None,
+) -> Prediction:
+    """Networks by the name of shipped weights or a training output folder, with depth as configured.
+
+    Raises:
+        SlamError: as `open_depth`.
+        ErfsfmError: as ``DepthPosePredictor.from_weights``.
+    """
+    source = open_depth(depth, intrinsics, numbers, undistort)
+    networks = DepthPosePredictor.from_weights(weights, device, "onnx")
     own = NetworkPredictor(networks, intrinsics)
-    return own if source is None else SourcedPredictor(own, source, config.align)
+    return Prediction(networks, source, own if source is None else SourcedPredictor(own, source, depth.align))

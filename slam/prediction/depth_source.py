@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.errors import COUNTED
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
 from slam.runtime.errors import SlamError
 
@@ -59,7 +58,6 @@ class SourcedPredictor:
         self._source = source
         self._align = align
         self._key = object()
-        self._is_known, self._unknown = False, list[int]()  # depth of a frame so far, and of which it is not
         self.sources = networks.sources
 
     def executor(self) -> Executor:
@@ -68,12 +66,10 @@ class SourcedPredictor:
 
     def depth(self, frame: Frame) -> DepthMap:
         """Z-depth ``(H, W)`` at the image's size, NaN where unknown."""
-        aligned = self._aligned(frame)
-        self._unknown += [frame.index] if np.isnan(aligned.unit) else []
-        self._is_known |= not np.isnan(aligned.unit)
-        while self._is_known and self._unknown:  # else `snippet` refuses all of them
-            logger.warning("frame %d has no known depth in %s", self._unknown.pop(0), self._source.name, extra=COUNTED)
-        return aligned.depth
+        depth, unit = self._aligned(frame)
+        if np.isnan(unit):
+            logger.warning("frame %d has no known depth in %s", frame.index, self._source.name)
+        return depth
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet in the unit of the target's depth, or the nearest known frame's.
@@ -85,7 +81,7 @@ class SourcedPredictor:
         if self._align != "none":
             return snippet
         by_distance = sorted(frames, key=lambda frame: (abs(frame.index - snippet.target), -frame.index))
-        units = (self._aligned(frame).unit for frame in by_distance)
+        units = (self._aligned(frame)[1] for frame in by_distance)
         unit = next((unit for unit in units if not np.isnan(unit)), None)
         if unit is None:
             raise SlamError(
@@ -96,10 +92,11 @@ class SourcedPredictor:
         T_source_target[:, :3, 3] *= unit
         return replace(snippet, T_source_target=T_source_target)
 
-    def _aligned(self, frame: Frame) -> _Aligned:
+    def _aligned(self, frame: Frame) -> tuple[DepthMap, float]:
+        """Depth ``(H, W)``, and the source's unaligned depth over the networks', NaN where unknown."""
         return frame.derived((self._key, "aligned"), lambda: self._align_to_networks(frame))
 
-    def _align_to_networks(self, frame: Frame) -> _Aligned:
+    def _align_to_networks(self, frame: Frame) -> tuple[DepthMap, float]:
         height, width = frame.image.shape[:2]
         disparity = self._source.disparity(frame)
         disparity = at_size(disparity, height, width)
@@ -108,22 +105,14 @@ class SourcedPredictor:
         known = np.isfinite(own)
         own, wanted = own[known], wanted[known]
         if len(own) < _LEAST_COMPARED:
-            return _Aligned(np.full((height, width), np.nan, np.float32), np.nan)
+            return np.full((height, width), np.nan, np.float32), np.nan
         unit = _unit(own, wanted)
         if self._align == "affine":
             gain, shift = _affine(own, wanted, unit)
             disparity = known_only(gain * disparity + shift)
         elif self._align == "scale":
             disparity = disparity * np.float32(unit)
-        return _Aligned(np.asarray(1 / disparity, np.float32), unit)
-
-
-@dataclass(frozen=True)
-class _Aligned:
-    """Depth ``(H, W)`` of a frame; ``unit`` is the source's unaligned depth over the networks', NaN where unknown."""
-
-    depth: DepthMap
-    unit: float
+        return np.asarray(1 / disparity, np.float32), unit
 
 
 def known_only(values: NDArray[np.floating]) -> NDArray[np.float32]:

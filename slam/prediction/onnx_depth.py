@@ -7,7 +7,6 @@ elsewhere is refused.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import onnx
 import onnxruntime
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
+from onnx.external_data_helper import convert_model_from_external_data
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from erfsfm.common.files import read_bytes
@@ -47,15 +47,17 @@ class OnnxDepth:
         """
         self.name = config.source
         self._path = Path(config.source.partition(":")[2]).expanduser()
-        content = self._content()
+        try:
+            content = read_bytes(self._path, _MOST_BYTES)
+        except OSError as error:
+            raise SlamError(f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE") from error
         self.sha256 = hashlib.sha256(content).hexdigest()
-        notes = self._require_whole(content)
-        self._session = self._loaded(content)
+        self._session, notes = self._opened(content)
         self._input, self._shape, self._height, self._width = self._image_input(config)
         own = notes.get("input") == _OWN_INPUT and notes.get("kind") == "depth"
         self._kind, self._mean, self._std = self._settings(config, own)
         self._output = self._depth_output(config)
-        self._run(np.zeros((self._height, self._width, 3), np.uint8))
+        self.infer(np.zeros((self._height, self._width, 3), np.uint8))
 
     def disparity(self, frame: Frame) -> Disparity:
         """1/depth at the network's own size, NaN where unknown; raises as ``infer``."""
@@ -67,16 +69,13 @@ class OnnxDepth:
         Raises:
             SlamError: the network fails, or its output is no map.
         """
-        return self._run(image)
-
-    def _run(self, image: Image) -> NDArray[np.float32]:
         resized = resize_image(image, self._height, self._width).astype(np.float32)
         values = resized / (255 * self._std) - self._mean / self._std  # (h, w, 3)
         tensor = values.transpose(2, 0, 1) if self._shape[-3] == 3 else values
         tensor = np.ascontiguousarray(tensor[(None,) * (len(self._shape) - 3)], _TYPES[self._input.type])
         try:
             (output,) = self._session.run([self._output], {self._input.name: tensor})
-        except self._errors() as error:
+        except _errors() as error:
             raise SlamError(
                 f"{self._path} fails on an image of {self._width}x{self._height}: {_short(error)}"
             ) from error
@@ -89,32 +88,27 @@ class OnnxDepth:
             )
         return np.asarray(found.reshape(sides), dtype=np.float32)
 
-    def _content(self) -> bytes:
-        try:
-            return read_bytes(self._path, _MOST_BYTES)
-        except OSError as error:
-            raise SlamError(f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE") from error
-
-    def _require_whole(self, content: bytes) -> dict[str, str]:
-        """The metadata of a graph whose weights are all in its file."""
+    def _opened(self, content: bytes) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
+        """A graph whose weights are all in its file, ready to run, and its metadata."""
         try:
             model = onnx.load_model_from_string(content)
+            if not model.graph.node:
+                raise DecodeError("no operators in it")
         except DecodeError as error:
             raise SlamError(f"{self._path} is damaged or no ONNX file ({error}): copy or export it again") from error
-        if not model.graph.node:
-            raise SlamError(f"{self._path} is damaged or no ONNX file (no operators in it): copy or export it again")
-        if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(model)):
-            raise SlamError(f"{self._path} keeps weights in other files, which are not read: save it as one file")
-        return {entry.key: entry.value for entry in model.metadata_props}
-
-    def _loaded(self, content: bytes) -> onnxruntime.InferenceSession:
         try:
-            return open_session(content, NETWORK_THREADS)
-        except self._errors() as error:
+            convert_model_from_external_data(model)  # marks weights in other files as read, or finds that they are not
+        except ValueError as error:
+            reason = "keeps weights in other files, which are not read: save it as one file"
+            raise SlamError(f"{self._path} {reason}") from error
+        try:
+            session = open_session(model.SerializeToString(), NETWORK_THREADS)
+        except _errors() as error:
             raise SlamError(
                 f"{self._path} cannot be run by onnxruntime {onnxruntime.__version__}, with its own operators alone: "
                 f"{_short(error)}"
             ) from error
+        return session, {entry.key: entry.value for entry in model.metadata_props}
 
     def _settings(self, config: DepthConfig, own: bool) -> tuple[Kind, NDArray[np.float32], NDArray[np.float32]]:
         """Kind of the output, mean and standard deviation of the input; those of our own exports are known."""
@@ -148,23 +142,17 @@ class OnnxDepth:
                 f"{described}"
             )
         sides = shape[-2:] if channels_first else shape[-3:-1]
-        height, width = (
-            self._side(name, fixed, given)
-            for name, fixed, given in zip(("height", "width"), sides, (config.height, config.width), strict=True)
-        )
-        return inputs[0], shape, height, width
-
-    def _side(self, name: str, fixed: Any, given: int) -> int:
-        if not isinstance(fixed, int):
-            if not given:
+        size = []
+        for name, fixed, given in zip(("height", "width"), sides, (config.height, config.width), strict=True):
+            if not isinstance(fixed, int) and not given:
                 raise SlamError(
                     f"{self._path} takes images of any size: set depth.height and depth.width, such as those of its "
                     "training"
                 )
-            return given
-        if given and given != fixed:
-            raise SlamError(f"{self._path} takes images of {name} {fixed}, not {given}: leave depth.{name} out")
-        return fixed
+            if isinstance(fixed, int) and given not in (0, fixed):
+                raise SlamError(f"{self._path} takes images of {name} {fixed}, not {given}: leave depth.{name} out")
+            size.append(given or fixed)
+        return inputs[0], shape, size[0], size[1]
 
     def _depth_output(self, config: DepthConfig) -> str:
         names = [str(each.name) for each in self._session.get_outputs()]
@@ -175,28 +163,11 @@ class OnnxDepth:
             raise SlamError(f"{self._path} has {wanted}: set depth.output_name to one of {', '.join(names)}")
         return names[0]
 
-    def _errors(self) -> tuple[type[Exception], ...]:
-        """What ONNX Runtime raises: classes without a common base of their own."""
-        own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
-        return (*own, RuntimeError, ValueError)
 
-
-def _tensors(model: Any) -> Iterator[Any]:
-    """All constant tensors of a model, also of nested graphs and functions."""
-    waiting = [model.graph]
-    nodes = [node for function in model.functions for node in function.node]
-    while waiting or nodes:
-        if waiting:
-            graph = waiting.pop()
-            yield from graph.initializer
-            for sparse in graph.sparse_initializer:
-                yield from (sparse.values, sparse.indices)
-            nodes += graph.node
-            continue
-        for attribute in nodes.pop().attribute:
-            yield attribute.t
-            yield from attribute.tensors
-            waiting += [*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])]
+def _errors() -> tuple[type[Exception], ...]:
+    """What ONNX Runtime raises: classes without a common base of their own."""
+    own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    return (*own, RuntimeError, ValueError)
 
 
 def _short(error: Exception) -> str:

@@ -12,8 +12,8 @@ from slam.geometry.se3 import FloatArray, apply
 from slam.mapping.filters import KeyframeDepth
 from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.metrics import DepthOfKeyframes
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.record import Missing
 from slam.sequences.excerpt import recording_of
 
 logger = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class DepthQuality:
             missing = "depth is not in metres (see scale)"
         elsewhere = "no keyframe has a neighbour at a useful distance" if is_refined else "depth.refine is none"
         why_not_refined = missing if network is None else elsewhere
-        return DepthOfKeyframes(network=network or Missing(missing), refined=refined or Missing(why_not_refined))
+        return DepthOfKeyframes.of(network=network or Failed(missing), refined=refined or Failed(why_not_refined))
 
 
 def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | None:

@@ -17,22 +17,26 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence, runs
+from slam.frontend import gps
 from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
-from slam.geometry.se3 import umeyama
+from slam.geometry.se3 import FloatArray, umeyama
 from slam.pipeline.estimate import Estimate
+from slam.pipeline.positioning import Location
 from slam.results.folder import RunFolder
-from slam.results.gps import gps_metrics
 from slam.results.metrics import (
     AgreementMetrics,
     ConfidenceMetrics,
     CoverageMetrics,
     Event,
+    GpsErrors,
+    GpsMetrics,
     GraphMetrics,
     LearnedDepthError,
     LoopMetrics,
     Metrics,
+    Origin,
     Provenance,
     ScaleMetrics,
     SequenceMetrics,
@@ -41,21 +45,20 @@ from slam.results.metrics import (
     TrackingMetrics,
     Trajectories,
 )
+from slam.runtime.attempt import Failed
 from slam.runtime.run_files import TRAJECTORIES
-from slam.runtime.storage.record import Missing
 from slam.runtime.timing import Stopwatch, peak_rss_mb
 
-_NO_TRUTH = Missing("the sequence has no true poses")
-_BY_MAPS = Missing("maps of keyframes give the poses, not steps from frame to frame")
-_NO_MAP_YET = Missing("the run ended before its map was whole")
+_NO_TRUTH = Failed("the sequence has no true poses")
+_BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
+_NO_MAP_YET = Failed("the run ended before its map was whole")
 
 
 def estimate_metrics(
     result: Estimate, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
 ) -> Metrics:
     """All metrics before the map is fused."""
-    sure = result.confidence
-    return Metrics(
+    return Metrics.of(
         schema_=1,
         status="estimated",
         reason="the run has not ended, or was killed while it made the map or the report",
@@ -64,15 +67,15 @@ def estimate_metrics(
         timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
         agreement=[AgreementMetrics(**asdict(each)) for each in result.agreements],
-        confidence=ConfidenceMetrics(run=sure if isinstance(sure, float) else Missing(sure.reason)),
+        confidence=ConfidenceMetrics.of(run=result.confidence),
         support=_BY_MAPS if result.support is None else result.support.round(2).tolist(),
-        trajectories=Trajectories(
+        trajectories=Trajectories.of(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),
             optimised=trajectory_metrics(result.optimised, result.reference),
             lidar=_lidar_metrics(result, sequence),
         ),
-        gps=gps_metrics(result, gps_in_graph),
+        gps=_gps(result, gps_in_graph),
         graph=_graph(result),
         loops=LoopMetrics.model_validate(result.loops.summary()),
         tracking=_tracking(result),
@@ -85,16 +88,16 @@ def estimate_metrics(
 def metrics_of_trajectories(folder: RunFolder) -> Trajectories:
     """Errors of the trajectories in the folder of a killed run; a reason for each missing one."""
     reference = folder.trajectory("reference")
-    found: dict[str, TrajectoryMetrics | Missing] = {}
+    found: dict[str, TrajectoryMetrics | Failed] = {}
     for name in TRAJECTORIES:
         estimate = folder.trajectory(name)
         if estimate is None:
-            found[name] = Missing("the run did not write this trajectory")
+            found[name] = Failed("the run did not write this trajectory")
         elif reference is None:
             found[name] = trajectory_metrics(estimate, None)
         else:
             found[name] = trajectory_metrics(*associate(estimate, reference))
-    return Trajectories(**found)
+    return Trajectories.of(**found)
 
 
 def lidar_trajectory(result: Estimate) -> Trajectory | None:
@@ -107,11 +110,11 @@ def lidar_trajectory(result: Estimate) -> Trajectory | None:
 def timing_of(watch: Stopwatch, frames: int) -> Timing:
     """The time of a run until now."""
     seconds, peak = watch.seconds, peak_rss_mb()
-    return Timing(
+    return Timing.of(
         seconds_total=seconds,
         frames_per_second=frames / seconds,
         cpu_seconds=watch.cpu_seconds,
-        peak_rss_mb=Missing("not available on Windows") if peak is None else peak,
+        peak_rss_mb=Failed("not available on Windows") if peak is None else peak,
         stages=dict(watch.stages),
     )
 
@@ -121,11 +124,11 @@ def _sequence(result: Estimate, sequence: Sequence) -> SequenceMetrics:
     span = float(sequence.stamps[-1] - sequence.stamps[0]) if frames > 1 else 0.0
     drive, reference = result.drive, result.reference
     scans = result.lidar.unreadable if isinstance(result.lidar, LidarPath) else {}
-    return SequenceMetrics(
+    return SequenceMetrics.of(
         name=sequence.name,
         frames=frames,
         length_m=_NO_TRUTH if reference is None else reference.length_m,
-        fps=(frames - 1) / span if span > 0 else Missing("all stamps are equal"),
+        fps=(frames - 1) / span if span > 0 else Failed("all stamps are equal"),
         bridged_frames=len(drive.interpolated),
         bridged=_stretches(drive.interpolated),
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
@@ -139,13 +142,13 @@ def _stretches(reasons: Mapping[int, str]) -> list[Stretch]:
     return [Stretch(first=first, last=last, reason=reasons[first]) for first, last in runs(reasons)]
 
 
-def _lidar_metrics(result: Estimate, sequence: Sequence) -> TrajectoryMetrics | Missing:
+def _lidar_metrics(result: Estimate, sequence: Sequence) -> TrajectoryMetrics | Failed:
     """Errors of LiDAR odometry at its frames."""
     path, lidar = result.lidar, lidar_trajectory(result)
     if isinstance(path, MeasurementFailure):
-        return Missing(path.reason)
+        return path
     if path is None or lidar is None:
-        return Missing("the sequence has no LiDAR scans")
+        return Failed("the sequence has no LiDAR scans")
     reference = None if result.reference is None else result.reference.select(path.frames).rebased()
     return trajectory_metrics(lidar, reference)
 
@@ -161,34 +164,32 @@ def _network_snippets(result: Estimate) -> SnippetErrors | None:
 
 def _scale(result: Estimate) -> ScaleMetrics:
     scale, estimate = result.scale, result.scale.estimate
-    said = ScaleMetrics(mode=scale.mode, unit=scale.unit, contradicted_steps=len(scale.contradicted))
-    if isinstance(estimate, MeasurementFailure):
-        return said.model_copy(update={"value": Missing(estimate.reason)})
-    return said.model_copy(update=asdict(estimate))
+    found = {"value": estimate} if isinstance(estimate, MeasurementFailure) else asdict(estimate)
+    return ScaleMetrics.of(mode=scale.mode, unit=scale.unit, contradicted_steps=len(scale.contradicted), **found)
 
 
 def _graph(result: Estimate) -> GraphMetrics:
     """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
-    if isinstance(result.graph, Missing):
-        return GraphMetrics.missing(result.graph.reason)
+    if isinstance(result.graph, Failed):
+        return GraphMetrics.unknown(result.graph.reason)
     nodes, factors = len(result.optimised), result.graph.relative_poses
     if result.reference is None:
-        return GraphMetrics(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)
+        return GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
-        still = Missing("the estimate does not move: the truth cannot be scaled to it")
-        return GraphMetrics(nodes=nodes, factors=len(factors), coverage=still)
+        still = Failed("the estimate does not move: the truth cannot be scaled to it")
+        return GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=still)
     covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
     by_source = {source: CoverageMetrics.model_validate(shares) for source, shares in covered.by_source.items()}
     overall = CoverageMetrics.model_validate(covered.overall)
     return GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
 
 
-def _tracking(result: Estimate) -> TrackingMetrics | Missing:
+def _tracking(result: Estimate) -> TrackingMetrics | Failed:
     """Keyframes, their maps, and what became of them."""
     drive = result.drive
     if not drive.maps:
-        return Missing("this drive has no map of keyframes: it is measured from step to step")
+        return Failed("this drive has no map of keyframes: it is measured from step to step")
     return TrackingMetrics(
         keyframes=sum(len(segment.map.keyframes) for segment in drive.maps),
         maps=len(set(drive.map_poses.linked.values())),
@@ -197,9 +198,40 @@ def _tracking(result: Estimate) -> TrackingMetrics | Missing:
     )
 
 
-def _depth_error(result: Estimate) -> list[LearnedDepthError] | Missing:
+def _depth_error(result: Estimate) -> list[LearnedDepthError] | Failed:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
     curve, unit = result.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
-        return Missing("no step triangulated corners with learned depth")
+        return Failed("no step triangulated corners with learned depth")
     return [LearnedDepthError(depth=unit * at, bias=b, sigma=s, corners=count) for at, b, s, count in curve]
+
+
+def _gps(result: Estimate, in_graph: bool) -> GpsMetrics | Failed:
+    """Distances of odometry and optimised trajectory from the fixes, and the place of the first camera."""
+    location = result.location
+    if not isinstance(location, Location):
+        return location or Failed("no GPS track was given")
+    T_enu_first = location.T_enu_world @ result.optimised.T_world_camera[0]
+    latitude, longitude, height = location.fixes.frame.places(T_enu_first[None, :3, 3])[0].tolist()
+    ahead = T_enu_first[:3, 2]
+    heading = float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0)
+    aligned = gps.align(location.fixes, result.odometry.T_world_camera, result.odometry.stamps)
+    return GpsMetrics.of(
+        fixes=len(location.fixes.stamps),
+        in_graph=in_graph,
+        origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
+        odometry=aligned
+        if isinstance(aligned, MeasurementFailure)
+        else _distances(location.fixes, aligned, result.odometry),
+        optimised=_distances(location.fixes, location.T_enu_world, result.optimised),
+    )
+
+
+def _distances(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> GpsErrors:
+    apart = gps.offsets(fixes, T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
+    level = np.linalg.norm(apart[:, :2], axis=1)
+    return GpsErrors(
+        horizontal_rmse_m=float(np.sqrt((level**2).mean())),
+        horizontal_median_m=float(np.median(level)),
+        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean())),
+    )

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from html import escape
 from pathlib import Path
 from typing import Any
 
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.metrics import Metrics
 from slam.results.output_folder import claim, stamped
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, trajectory_file
+from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, REPORT, trajectory_file
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import MISSING, Missing
+from slam.runtime.storage.record import NOT_RECORDED
 
 logger = logging.getLogger(__name__)
 
@@ -24,8 +25,14 @@ class RunFolder:
     """The files of one run, under the names of the contract (``docs/run-folder.md``)."""
 
     def __init__(self, path: str | Path) -> None:
-        """A folder that exists, such as ``results/latest``."""
+        """A folder that exists, such as ``results/latest``.
+
+        Raises:
+            RunError: it is not there.
+        """
         self.path = Path(path)
+        if not self.path.is_dir():
+            raise RunError(f"{path} is not there: give a folder that 'erfsfm-slam run' wrote")
 
     @classmethod
     def create(cls, output: Path | None, results: Path, sequence: str, lock: FolderLock | None = None) -> RunFolder:
@@ -115,10 +122,17 @@ class RunFolder:
         return import_open3d().io.read_point_cloud(str(self.require(MAP_CLOUD)))
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        from slam.results.notebook import html
+        """What a notebook shows: errors, and the unit of lengths."""
+        from slam.results.tables import errors_table
 
-        return html(self)
+        metrics = self.metrics()
+        title = f"{metrics.sequence.name or self.path.name}: {metrics.sequence.frames or 0} frames"
+        errors = metrics.evaluated_errors()
+        notes = [note for note in (metrics.failure, *metrics.unit_notes()) if note]
+        if (self.path / REPORT).is_file():
+            notes.append(f"Report: {self.path / REPORT}")
+        table = errors_table(errors).html() if errors else ""
+        return f"<h4>{escape(title)}</h4>{table}" + "".join(f"<p>{escape(note)}</p>" for note in notes)
 
     def require(self, name: str) -> Path:
         """The path of a file of the run.
@@ -135,7 +149,5 @@ class RunFolder:
 
     def _without_map(self) -> str:
         metrics = self.metrics()
-        triangles = metrics.map.triangles
-        if triangles == MISSING:
-            return metrics.failure or "it ran without a map"
-        return triangles.reason if isinstance(triangles, Missing) else "it ran without a map"
+        why = metrics.map.why("triangles")
+        return (metrics.failure or "it ran without a map") if why == NOT_RECORDED else why

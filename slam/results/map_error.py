@@ -9,13 +9,14 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slam.evaluation.map import OUTLIER_M, PlacedMetrics, ScaledMetrics, compare, placed_metrics, pose_similarity
+from slam.evaluation.map import ERRORS, OUTLIER_M, PlacedMetrics, compare, placed_metrics, pose_similarity
 from slam.evaluation.surface import RANGE_M, Indices, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import Intrinsics, Mask, Sequence
 from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.pipeline.estimate import Estimate
-from slam.results.metrics import MapErrors
+from slam.results.metrics import MAP_ERRORS, MapMetrics
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import recording_of
 
@@ -149,7 +150,7 @@ def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
 
 
-def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> MapErrors:
+def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> MapMetrics:
     """Errors of a map moved to the truth by one rigid motion, and under ``with_scale`` by a similarity.
 
     ``pieces`` iterates over the points of the map, ``(P, 3)`` each; of a long drive only those near the stretches that
@@ -157,7 +158,7 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
     """
     truth = find_truth(sequence)
     if isinstance(truth, str):
-        return MapErrors.missing(truth)
+        return MapMetrics.unknown(truth, *MAP_ERRORS)
     assert sequence.reference is not None
     fits = {
         "rigid": pose_similarity(sequence.reference, result.optimised.T_world_camera, with_scale=False),
@@ -173,14 +174,14 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
         found = compare(truth, sequence.reference, placed)
     except SlamError as error:
         logger.warning("the error of the map is not known: %s", error)
-        return MapErrors.missing(str(error))
+        return MapMetrics.unknown(str(error), *MAP_ERRORS)
     if truth.distance is None and len(found.distances["with_scale"].to_map) == 0:
-        return MapErrors.missing("no point of the true surface is known near the images")
-    with_scale = placed_metrics(ScaledMetrics, found.distances["with_scale"], scale=fits["with_scale"].scale)
+        return MapMetrics.unknown("no point of the true surface is known near the images", *MAP_ERRORS)
+    with_scale = placed_metrics(PlacedMetrics, found.distances["with_scale"], scale=fits["with_scale"].scale)
     more = {"truth": truth.name, "evaluated_m": found.length_m, "with_scale": with_scale}
     if unmetric:
-        return MapErrors(**dict(PlacedMetrics.missing("lengths are not in metres: see with_scale")) | more)
-    return placed_metrics(MapErrors, found.distances["rigid"], **more)
+        return MapMetrics.of(**dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale")), **more)
+    return placed_metrics(MapMetrics, found.distances["rigid"], **more)
 
 
 def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> FloatArray:

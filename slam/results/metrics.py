@@ -8,9 +8,9 @@ from pydantic import Field
 
 from slam.config.sections import ScaleMode
 from slam.evaluation.depth import DepthMetrics
-from slam.evaluation.map import PlacedMetrics, ScaledMetrics
+from slam.evaluation.map import ERRORS, PlacedMetrics
 from slam.evaluation.trajectory import TrajectoryMetrics
-from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record, known
+from slam.runtime.storage.record import Count, Record, part
 
 METRES = "metres"
 CAMERA_HEIGHTS = "camera heights"
@@ -20,30 +20,30 @@ NO_UNIT = "no metric unit"
 class Recording(Record):
     """Options that name the recording; none for the embedded street."""
 
-    dataset: Known[str] = MISSING
-    camera: Known[str] = MISSING
-    gps: Known[str] = MISSING
-    sequence: Known[str] = MISSING
-    frames: Known[str] = MISSING
-    truth: Known[str] = MISSING
+    dataset: str | None = None
+    camera: str | None = None
+    gps: str | None = None
+    sequence: str | None = None
+    frames: str | None = None
+    truth: str | None = None
 
 
 class Provenance(Record):
     """Version, command, weights and their training data, and where depth comes from."""
 
-    version: Known[str] = MISSING
-    commit: Known[str] = MISSING
-    command: Known[str] = MISSING
-    seed: Known[Count] = MISSING
-    device: Known[str] = MISSING
-    weights: Known[str] = MISSING
-    weights_sha256: Known[str] = MISSING
-    weights_licence: Known[str] = MISSING
-    trained_on: Known[list[str]] = MISSING
-    leak: Known[bool] = MISSING
-    depth_source: Known[str] = MISSING
-    depth_sha256: Known[str] = MISSING
-    recording: Known[Recording] = MISSING
+    version: str | None = None
+    commit: str | None = None
+    command: str | None = None
+    seed: Count | None = None
+    device: str | None = None
+    weights: str | None = None
+    weights_sha256: str | None = None
+    weights_licence: str | None = None
+    trained_on: list[str] | None = None
+    leak: bool | None = None
+    depth_source: str | None = None
+    depth_sha256: str | None = None
+    recording: Recording = part(Recording)
 
 
 class Stretch(Record):
@@ -57,36 +57,36 @@ class Stretch(Record):
 class SequenceMetrics(Record):
     """Size of the sequence and its true length; interpolated (``bridged``) and doubled frames, segments."""
 
-    name: Known[str] = MISSING
-    frames: Known[Count] = MISSING
-    length_m: Known[float] = MISSING
-    fps: Known[float] = MISSING
-    bridged_frames: Known[Count] = MISSING
-    bridged: Known[list[Stretch]] = MISSING
-    doubled: Known[list[Stretch]] = MISSING
-    unreadable_scans: Known[list[Stretch]] = MISSING
-    segments: Known[list[Stretch]] = MISSING
+    name: str | None = None
+    frames: Count | None = None
+    length_m: float | None = None
+    fps: float | None = None
+    bridged_frames: Count | None = None
+    bridged: list[Stretch] | None = None
+    doubled: list[Stretch] | None = None
+    unreadable_scans: list[Stretch] | None = None
+    segments: list[Stretch] | None = None
 
 
 class Timing(Record):
     """Seconds, frames a second over the whole run, processor seconds, peak memory, seconds by stage."""
 
-    seconds_total: Known[float] = MISSING
-    frames_per_second: Known[float] = MISSING
-    cpu_seconds: Known[float] = MISSING
-    peak_rss_mb: Known[float] = MISSING
-    stages: Known[dict[str, float]] = MISSING
+    seconds_total: float | None = None
+    frames_per_second: float | None = None
+    cpu_seconds: float | None = None
+    peak_rss_mb: float | None = None
+    stages: dict[str, float] | None = None
 
 
 class ScaleMetrics(Record):
     """Unit of length, and the factor from the networks' unit to it."""
 
-    mode: Known[ScaleMode] = MISSING
-    unit: Known[str] = MISSING
-    value: Known[float] = MISSING
-    spread: Known[float] = MISSING
-    frames_used: Known[Count] = MISSING
-    contradicted_steps: Known[Count] = MISSING
+    mode: ScaleMode | None = None
+    unit: str | None = None
+    value: float | None = None
+    spread: float | None = None
+    frames_used: Count | None = None
+    contradicted_steps: Count | None = None
 
 
 class AgreementMetrics(Record):
@@ -94,68 +94,68 @@ class AgreementMetrics(Record):
 
     source: str
     beside: str = "the images"
-    sigmas: Known[float] = MISSING
-    figure: Known[str] = MISSING
+    sigmas: float | None = None
+    figure: str | None = None
 
 
 class ConfidenceMetrics(Record):
     """Share of drives of this kind that err by at most 1 % of their path."""
 
-    run: Known[float] = MISSING
+    run: float | None = None
 
 
 class Trajectories(Record):
     """Errors by trajectory."""
 
-    network: Known[TrajectoryMetrics] = MISSING
-    odometry: Known[TrajectoryMetrics] = MISSING
-    optimised: Known[TrajectoryMetrics] = MISSING
-    lidar: Known[TrajectoryMetrics] = MISSING
+    network: TrajectoryMetrics = part(TrajectoryMetrics)
+    odometry: TrajectoryMetrics = part(TrajectoryMetrics)
+    optimised: TrajectoryMetrics = part(TrajectoryMetrics)
+    lidar: TrajectoryMetrics = part(TrajectoryMetrics)
 
 
 class Origin(Record):
     """Place and heading of the first camera on the earth."""
 
-    latitude_deg: Known[float] = MISSING
-    longitude_deg: Known[float] = MISSING
-    altitude_m: Known[float] = MISSING
-    heading_deg: Known[float] = MISSING
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    altitude_m: float | None = None
+    heading_deg: float | None = None
 
 
 class GpsErrors(Record):
     """Distances of a trajectory from the fixes."""
 
-    horizontal_rmse_m: Known[float] = MISSING
-    horizontal_median_m: Known[float] = MISSING
-    vertical_rmse_m: Known[float] = MISSING
+    horizontal_rmse_m: float | None = None
+    horizontal_median_m: float | None = None
+    vertical_rmse_m: float | None = None
 
 
 class GpsMetrics(Record):
     """The run beside its GPS track."""
 
-    fixes: Known[Count] = MISSING
-    in_graph: Known[bool] = MISSING
-    origin: Known[Origin] = MISSING
-    odometry: Known[GpsErrors] = MISSING
-    optimised: Known[GpsErrors] = MISSING
+    fixes: Count | None = None
+    in_graph: bool | None = None
+    origin: Origin = part(Origin)
+    odometry: GpsErrors = part(GpsErrors)
+    optimised: GpsErrors = part(GpsErrors)
 
 
 class CoverageMetrics(Record):
     """Share of factors inside so many per cent of their stated noise, and their number where they are of one source."""
 
-    factors: Known[Count] = MISSING
-    inside_50: Known[float] = Field(default=MISSING, alias="50")
-    inside_90: Known[float] = Field(default=MISSING, alias="90")
-    inside_95: Known[float] = Field(default=MISSING, alias="95")
+    factors: Count | None = None
+    inside_50: float | None = Field(default=None, alias="50")
+    inside_90: float | None = Field(default=None, alias="90")
+    inside_95: float | None = Field(default=None, alias="95")
 
 
 class GraphMetrics(Record):
     """Size of the graph and coverage of its noise."""
 
-    nodes: Known[Count] = MISSING
-    factors: Known[Count] = MISSING
-    coverage: Known[CoverageMetrics] = MISSING
-    coverage_by_source: Known[dict[str, CoverageMetrics]] = MISSING
+    nodes: Count | None = None
+    factors: Count | None = None
+    coverage: CoverageMetrics = part(CoverageMetrics)
+    coverage_by_source: dict[str, CoverageMetrics] | None = None
 
 
 class LoopEnds(Record):
@@ -169,23 +169,23 @@ class LoopEnds(Record):
 class AcceptedLoop(LoopEnds):
     """A loop with its measured relative pose ``(4, 4)``."""
 
-    T_from_to: Known[list[list[float]]] = MISSING
+    T_from_to: list[list[float]] | None = None
 
 
 class LoopsFile(Record):
     """``loops.json``, as far as it is read back."""
 
-    accepted: Known[list[AcceptedLoop]] = MISSING
-    rejected_left_out: Known[Count] = MISSING
+    accepted: list[AcceptedLoop] | None = None
+    rejected_left_out: Count | None = None
 
 
 class LoopMetrics(Record):
     """Loops by how far they came."""
 
-    candidates: Known[Count] = MISSING
-    verified: Known[Count] = MISSING
-    accepted: Known[Count] = MISSING
-    rejected: Known[list[LoopEnds]] = MISSING
+    candidates: Count | None = None
+    verified: Count | None = None
+    accepted: Count | None = None
+    rejected: list[LoopEnds] | None = None
 
 
 class Event(Record):
@@ -200,53 +200,52 @@ class Event(Record):
 class TrackingMetrics(Record):
     """Keyframes, maps that neither turns nor loops join, and the number of frames that have a pose in one."""
 
-    keyframes: Known[Count] = MISSING
-    maps: Known[Count] = MISSING
-    located_frames: Known[Count] = MISSING
-    events: Known[list[Event]] = MISSING
+    keyframes: Count | None = None
+    maps: Count | None = None
+    located_frames: Count | None = None
+    events: list[Event] | None = None
 
 
 class LearnedDepthError(Record):
     """Bias and relative sigma of learned depth at one depth."""
 
-    depth: Known[float] = MISSING
-    bias: Known[float] = MISSING
-    sigma: Known[float] = MISSING
-    corners: Known[float] = MISSING
+    depth: float | None = None
+    bias: float | None = None
+    sigma: float | None = None
+    corners: float | None = None
 
 
 class DepthOfKeyframes(Record):
     """Errors of the keyframes' depth, as learned and refined."""
 
-    network: Known[DepthMetrics] = MISSING
-    refined: Known[DepthMetrics] = MISSING
+    network: DepthMetrics = part(DepthMetrics)
+    refined: DepthMetrics = part(DepthMetrics)
 
 
-class MapSizes(Record):
-    """Sizes of the map, and what filters took."""
+class MapMetrics(PlacedMetrics):
+    """The map: its sizes, what filters took, and its errors by the best truth, rigidly moved and ``with_scale``."""
 
-    triangles: Known[Count] = MISSING
-    points: Known[Count] = MISSING
-    blocks: Known[Count] = MISSING
-    submaps: Known[Count] = MISSING
-    frames_fused: Known[Count] = MISSING
-    frames_left_out: Known[Count] = MISSING
-    voxel_size: Known[float] = MISSING
-    filters: Known[dict[str, float]] = MISSING
-    floater_share: Known[float] = MISSING
-    double_wall_share: Known[float] = MISSING
-
-
-class MapErrors(PlacedMetrics):
-    """Errors of the map by the best truth that there is, after a rigid motion and after one with a scale."""
-
-    truth: Known[str] = MISSING
-    evaluated_m: Known[float] = MISSING
-    with_scale: Known[ScaledMetrics] = MISSING
+    triangles: Count | None = None
+    points: Count | None = None
+    blocks: Count | None = None
+    submaps: Count | None = None
+    frames_fused: Count | None = None
+    frames_left_out: Count | None = None
+    voxel_size: float | None = None
+    filters: dict[str, float] | None = None
+    floater_share: float | None = None
+    double_wall_share: float | None = None
+    truth: str | None = None
+    evaluated_m: float | None = None
+    with_scale: PlacedMetrics = part(PlacedMetrics)
 
 
-class MapMetrics(MapErrors, MapSizes):
-    """The map: its sizes and its errors."""
+SIZES = (
+    *("triangles", "points", "blocks", "submaps", "frames_fused", "frames_left_out", "voxel_size", "filters"),
+    *("floater_share", "double_wall_share"),
+)
+MAP_ERRORS = (*ERRORS, "truth", "evaluated_m", "with_scale")
+"""The values of `MapMetrics` that the map alone gives, and those of its comparison with the truth."""
 
 
 class Metrics(Record):
@@ -254,22 +253,22 @@ class Metrics(Record):
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
     status: Literal["running", "estimated", "ok", "failed"] = "ok"
-    reason: Known[str] = MISSING
-    provenance: Known[Provenance] = MISSING
-    sequence: Known[SequenceMetrics] = MISSING
-    timing: Known[Timing] = MISSING
-    scale: Known[ScaleMetrics] = MISSING
-    agreement: Known[list[AgreementMetrics]] = MISSING
-    confidence: Known[ConfidenceMetrics] = MISSING
-    support: Known[list[float]] = MISSING
-    trajectories: Known[Trajectories] = MISSING
-    gps: Known[GpsMetrics] = MISSING
-    graph: Known[GraphMetrics] = MISSING
-    loops: Known[LoopMetrics] = MISSING
-    tracking: Known[TrackingMetrics] = MISSING
-    depth_error: Known[list[LearnedDepthError]] = MISSING
-    depth: Known[DepthOfKeyframes] = MISSING
-    map: Known[MapMetrics] = MISSING
+    reason: str | None = None
+    provenance: Provenance = part(Provenance)
+    sequence: SequenceMetrics = part(SequenceMetrics)
+    timing: Timing = part(Timing)
+    scale: ScaleMetrics = part(ScaleMetrics)
+    agreement: list[AgreementMetrics] | None = None
+    confidence: ConfidenceMetrics = part(ConfidenceMetrics)
+    support: list[float] | None = None
+    trajectories: Trajectories = part(Trajectories)
+    gps: GpsMetrics = part(GpsMetrics)
+    graph: GraphMetrics = part(GraphMetrics)
+    loops: LoopMetrics = part(LoopMetrics)
+    tracking: TrackingMetrics = part(TrackingMetrics)
+    depth_error: list[LearnedDepthError] | None = None
+    depth: DepthOfKeyframes = part(DepthOfKeyframes)
+    map: MapMetrics = part(MapMetrics)
 
     @classmethod
     def of_begun_run(cls, provenance: Provenance) -> Metrics:
@@ -279,26 +278,27 @@ class Metrics(Record):
 
     def changed(self, **values: Any) -> Metrics:
         """With other values; None takes one out."""
-        own = {name: getattr(self, name) for name in self.model_fields_set} | values
-        return Metrics(**{name: value for name, value in own.items() if value is not None})
+        own = {name: getattr(self, name) for name in self.model_fields_set - {"absent", "reasons"}} | values
+        reasons = {name: why for name, why in self.reasons.items() if name not in values}
+        return Metrics.of(**{k: v for k, v in own.items() if v is not None or k in reasons}, reasons=reasons)
 
-    def all_errors(self) -> dict[str, TrajectoryMetrics | Missing]:
-        """Errors by trajectory, or the reasons of missing ones."""
-        return {name: getattr(self.trajectories, name) for name in Trajectories.model_fields}
+    def all_errors(self) -> dict[str, TrajectoryMetrics]:
+        """Errors by trajectory, also of absent ones."""
+        return {name: getattr(self.trajectories, name) for name in Trajectories.names()}
 
-    def evaluated_errors(self) -> dict[str, TrajectoryMetrics | Missing]:
+    def evaluated_errors(self) -> dict[str, TrajectoryMetrics]:
         """Errors of the trajectories that have them."""
-        return {name: errors for name, errors in self.all_errors().items() if not isinstance(errors, Missing)}
+        return {} if self.trajectories.absent else {k: each for k, each in self.all_errors().items() if not each.absent}
 
     @property
     def failure(self) -> str:
         """Why the run failed or did not end, in one line; empty if it is whole."""
-        return "" if self.status == "ok" else " ".join((known(self.reason) or "no reason recorded").split())
+        return "" if self.status == "ok" else " ".join((self.reason or "no reason recorded").split())
 
     @property
     def unit(self) -> str:
         """``metres``, ``camera heights``, or without a road ``no metric unit`` or ``the networks' own unit``."""
-        return known(self.scale.unit) or METRES
+        return self.scale.unit or METRES
 
     @property
     def is_metric(self) -> bool:
@@ -314,7 +314,7 @@ class Metrics(Record):
                 "For metres: camera_height_m in camera.yaml, a GPS track or scale.mode=known."
             ]
         if self.scale.mode == "none" and self.unit == NO_UNIT:
-            seen, frames = known(self.scale.frames_used), known(self.sequence.frames)
+            seen, frames = self.scale.frames_used, self.sequence.frames
             return [
                 f"No metric unit: {seen} of {frames} frames see a road. Only "
                 "the alignments with scale (scale, 7 dof) compare with metres. For metres, give the distance of two "
@@ -322,5 +322,4 @@ class Metrics(Record):
             ]
         if self.is_metric:
             return []
-        why = self.scale.value.reason if isinstance(self.scale.value, Missing) else MISSING.reason
-        return [f"No scale was found ({why}): lengths are in {self.unit}, not in metres."]
+        return [f"No scale was found ({self.scale.why('value')}): lengths are in {self.unit}, not in metres."]

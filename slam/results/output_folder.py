@@ -16,7 +16,6 @@ from erfsfm.common.files import unfinished_name
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import MEANINGS, METRICS
-from slam.runtime.storage.record import Missing
 
 logger = logging.getLogger(__name__)
 
@@ -85,8 +84,7 @@ def _is_run(metrics: Path) -> bool:
         content = Metrics.read(metrics)
     except (OSError, RunError):
         return False
-    named = not isinstance(content.provenance.weights_sha256, Missing)
-    return named and {"schema_", "status"} <= content.model_fields_set
+    return content.provenance.weights_sha256 is not None and {"schema_", "status"} <= content.model_fields_set
 
 
 def _is_rest(path: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,12 +12,14 @@ from pathlib import Path
 class RunLog(logging.Handler):
     """Buffers records until there is a file, then writes each at once.
 
-    On a full disk lines are lost without a message.
+    Of those that give one reason again and again the first is written, and at the end their number. On a full disk
+    lines are lost without a message.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._kept: list[logging.LogRecord] = []
+        self._times: Counter[tuple[str, str]] = Counter()
         self._file: _QuietFile | None = None
 
     def begin(self, path: Path) -> None:
@@ -29,6 +32,11 @@ class RunLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write or buffer a record."""
+        reason = record.args[-1] if isinstance(record.args, tuple) and record.args else None
+        if record.levelno == logging.INFO and isinstance(reason, str):
+            self._times[record.msg, reason] += 1
+            if self._times[record.msg, reason] > 1:
+                return
         if self._file is None:
             self._kept.append(record)
         else:
@@ -36,12 +44,17 @@ class RunLog(logging.Handler):
 
     def failed(self, reason: str) -> None:
         """Write the reason of a failure to the file alone: the caller gets the exception."""
-        message = f"the run failed: {reason}"
-        self.handle(logging.LogRecord("slam.commands.run.run", logging.ERROR, __file__, 0, message, None, None))
+        self._say(logging.ERROR, f"the run failed: {reason}")
+
+    def _say(self, level: int, message: str) -> None:
+        self.handle(logging.LogRecord("slam.commands.run.run", level, __file__, 0, message, None, None))
 
     def close(self) -> None:
-        """Close the file."""
+        """Write how often reasons were given again and again, and close the file."""
         if self._file is not None:
+            for (_, reason), times in self._times.items():
+                if times > 1:
+                    self._say(logging.INFO, f"{times} times: {reason}")
             self._file.close()
         super().close()
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,22 +11,18 @@ from typing import Any
 
 import numpy as np
 
+from erfsfm.common.table import Table, csv_of
 from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
-from slam.results.error_columns import COLUMNS, DASH, ErrorColumn, missing_by_reason, written
 from slam.results.folder import RunFolder
-from slam.results.terminal_tables import UNITS
+from slam.results.tables import COLUMNS, UNITS, ErrorColumn, missing_notes, written
 from slam.runtime.errors import RunError, TrajectoryError
 from slam.runtime.run_files import REFERENCE
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import Missing
-from slam.runtime.terminal import TerminalTable
 from slam.sequences.excerpt import frame_range
 
 logger = logging.getLogger(__name__)
-
-_COLUMNS = COLUMNS[:-1]  # without the difference to evo
 
 
 @dataclass(frozen=True)
@@ -114,12 +108,11 @@ def compare(
     return runs
 
 
-def systems_table(runs: Sequence[SystemRun], reference: Path) -> TerminalTable:
+def systems_table(runs: Sequence[SystemRun], reference: Path) -> Table:
     """A row for each system; of several trajectories of one, the mean and the deviation of a sample."""
-    reasons = missing_by_reason({run.system: run.errors for run in runs}, _COLUMNS)
-    notes = [f"{DASH} {', '.join(names)}: {reason}." for reason, names in reasons.items()]
-    title = f"Errors against {reference}"
-    return TerminalTable(["system", "poses", *(c.short for c in _COLUMNS)], list(_rows(runs)), title, [UNITS, *notes])
+    notes = [UNITS, *missing_notes({run.system: run.errors for run in runs})]
+    head = ["system", "poses", *(column.name for column in COLUMNS)]
+    return Table(head, list(_rows(runs)), f"Errors against {reference}", notes)
 
 
 def write_csv(runs: Sequence[SystemRun], output: Path) -> None:
@@ -128,12 +121,7 @@ def write_csv(runs: Sequence[SystemRun], output: Path) -> None:
     Raises:
         RunError: the file cannot be written.
     """
-    rows = [dict(_flat(run.tree())) for run in runs]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)))
-    writer.writeheader()
-    writer.writerows(rows)
-    content = text.getvalue()
+    content = csv_of(dict(_flat(run.tree())) for run in runs)
     write_atomically(output, lambda partial: partial.write_text(content, encoding="utf-8", newline=""), RunError)
 
 
@@ -142,12 +130,12 @@ def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
         own = [run for run in runs if run.system == system]
         poses = "/".join(map(str, sorted({len(run.estimate) for run in own})))
         name = f"{system} ({len(own)} runs)" if len(own) > 1 else system
-        yield [name, poses, *(_spread(column, own) for column in _COLUMNS)]
+        yield [name, poses, *(_spread(column, own) for column in COLUMNS)]
 
 
 def _spread(column: ErrorColumn, runs: Sequence[SystemRun]) -> str:
     """The number of one run; of several the mean and the deviation of those that have it."""
-    values = [value for value in (column.value(run.errors) for run in runs) if not isinstance(value, Missing)]
+    values = [value for value in (run.errors.at(column.path)[0] for run in runs) if value is not None]
     if len(values) < 2:
         return written(values[0] if values else None, column.decimals)
     mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))

@@ -8,12 +8,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
-from erfsfm.common.readers.pinhole import Pinhole
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.sequences.foreign_camera import read_foreign_camera
@@ -37,25 +36,36 @@ class Sized(Protocol):
 
 @sequence_errors()
 def find_camera_file(
-    explicit: Path | None, *folders: Path, wanted_by: str, images: Sized, fps: float | None = None
+    explicit: Path | None,
+    *folders: Path,
+    wanted_by: str,
+    images: Sized,
+    fps: float | None = None,
+    own: Callable[[], CameraFile] | None = None,
 ) -> CameraFile:
-    """The camera given by the user, or else the first ``camera.yaml`` found in ``folders``.
+    """The camera given by the user, or else the recording's own, or the first ``camera.yaml`` found in ``folders``.
 
     Args:
         explicit: a ``camera.yaml``, or ``fov=DEGREES[,fps=RATE]``.
-        folders: where a ``camera.yaml`` may lie.
+        folders: where a ``camera.yaml`` may lie; where there is a calibration of the recording's own, it gives the
+            height of the camera and its read-out alone.
         wanted_by: what needs it, for the message.
         images: the images that it took, for a camera by its field of view.
         fps: their rate where known, for the same; 10 a second otherwise.
+        own: reads the calibration of the recording, where it has one; not called where the user gave another.
 
     Raises:
         SequenceError: if there is none, or it is wrong.
     """
     if explicit is not None:
         return explicit_camera(explicit, images, fps)
-    found = beside(*folders)
-    if found is not None:
-        return found
+    camera = None if own is None else own()
+    found = beside(*folders, own=None if camera is None else camera.model_dump())
+    if camera is not None and found is not None:
+        return camera.model_copy(update={"camera_height_m": found.camera_height_m, "readout_ms": found.readout_ms})
+    camera = camera or found
+    if camera is not None:
+        return camera
     places = " and ".join(dict.fromkeys(str(folder) for folder in folders))
     raise SequenceError(
         f"no {CAMERA_FILE} for {wanted_by}: looked in {places}; put one there or give it with --camera "
@@ -88,27 +98,6 @@ def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
     return read_camera_file(path) if foreign is None else foreign
 
 
-def own_camera(own: Callable[[], CameraFile], asked: Path | None, images: Sized, *folders: Path) -> CameraFile:
-    """The camera of a recording with a calibration of its own.
-
-    Args:
-        own: reads that calibration; not called where the user gave another.
-        asked: what the user gave in its place.
-        images: the images.
-        folders: where a ``camera.yaml`` may lie; it gives the height of the camera and its read-out alone.
-
-    Raises:
-        SequenceError: if a camera file is wrong.
-    """
-    if asked is not None:
-        return explicit_camera(asked, images)
-    camera = own()
-    found = beside(*folders, own=camera.model_dump())
-    if found is None:
-        return camera
-    return camera.model_copy(update={"camera_height_m": found.camera_height_m, "readout_ms": found.readout_ms})
-
-
 @sequence_errors()
 def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile | None:
     """The first ``camera.yaml`` found in ``folders``, or None; keys that it lacks are those of the ``own`` camera.
@@ -118,15 +107,6 @@ def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile |
     """
     path = next((folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).exists()), None)
     return None if path is None else read_camera_file(path, own)
-
-
-def mount_beside(pinhole: Pinhole, usual_m: float | None, *folders: Path) -> tuple[float | None, float]:
-    """A calibrated camera's height in metres and read-out in seconds by the first ``camera.yaml`` in ``folders``.
-
-    ``usual_m`` is the height where none says it.
-    """
-    found = beside(*folders, own={**asdict(pinhole), "fps": DEFAULT_FPS})
-    return (usual_m, 0.0) if found is None else (found.height_or(usual_m), found.readout_ms / 1e3)
 
 
 def as_known(intrinsics: Intrinsics, asked: Path | None) -> Intrinsics:

@@ -14,14 +14,14 @@ from erfsfm.common.readers.video import VIDEO_SUFFIXES
 from slam.frames import Sequence
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.runtime.imports import import_plug_in, plug_ins
-from slam.sequences import euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
+from slam.sequences import folder, kitti, layouts
 from slam.sequences.camera_file import as_known
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
-from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import read_truth
+from slam.sequences.recording import RecordedSequence
 from slam.sequences.ros import loader as ros
 from slam.sequences.series import find_series, open_series
-from slam.sequences.truth import take_truth
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
 KITTI_NAME = "KITTI"
@@ -31,19 +31,7 @@ EMBEDDED_FRAMES = 320
 PLUG_INS = "erfsfm_slam.sequences"  # entry points of other packages: each names a `Loader`
 
 # the first that recognises a path opens it; loaders of other packages come before these
-LOADERS: tuple[Loader, ...] = (
-    odometry.LOADER,
-    raw.LOADER,
-    euroc.LOADER,
-    tum.LOADER,
-    tum_mono.LOADER,
-    seven_scenes.LOADER,
-    scannet.LOADER,
-    nuscenes.LOADER,
-    folder.LOADER,
-    ros.LOADER,
-    video.LOADER,
-)
+LOADERS: tuple[Loader, ...] = (*kitti.LOADERS, *layouts.LOADERS, folder.IMAGES, ros.LOADER, folder.VIDEO)
 
 
 @dataclass(frozen=True)
@@ -89,7 +77,9 @@ def open_sequence(
         sequence = _choose(root, Asked(name, camera))
         sequence.intrinsics = as_known(sequence.intrinsics, camera)
     if truth is not None:
-        take_truth(sequence, truth)
+        if not isinstance(sequence, RecordedSequence):
+            raise SequenceError(f"the loader of this recording takes no true poses: leave out --truth {truth}")
+        sequence.take_truth(read_truth(truth, sequence.stamps))
     if frames is None:
         return sequence
     return Excerpt(sequence, *frame_range(frames, len(sequence)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, cast
 
 from slam.frames import Frame, Sequence
 from slam.geometry.se3 import FloatArray
@@ -70,6 +70,12 @@ class Excerpt:
 def recording_of(sequence: Sequence) -> tuple[Sequence, int]:
     """The recording of a sequence, and which frame of it frame 0 is."""
     return (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
+
+
+def first_frames(sequence: Sequence, count: int) -> Excerpt:
+    """The first frames of a recording, or of an excerpt."""
+    base, start = recording_of(sequence)
+    return Excerpt(cast("SourcedSequence", base), start, start + count)
 
 
 def undistortion_of(recording: Sequence) -> Undistortion | None:

@@ -1,4 +1,4 @@
-"""A folder of images with a ``camera.yaml`` and perhaps a ``times.txt``."""
+"""A user's own recordings, with a ``camera.yaml`` or a field of view: folders of images and videos."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.common.readers.folder import image_folder, recording_name
+from erfsfm.common.readers.folder import clip_name, image_folder, recording_name, video_name
 from erfsfm.common.readers.images import list_images
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
+from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
@@ -21,7 +22,9 @@ from slam.sequences.recording import RecordedSequence, Source, read_stamps, unif
 
 logger = logging.getLogger(__name__)
 
-TIMES = "times.txt"
+TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
+_UNEVEN = 0.25  # of an interval
+_RATE_TOLERANCE = 0.1
 # seconds since 1970 with decimals, milli-, micro- or nanoseconds
 _NAMED_BY_TIME = re.compile(r"(?:\D*[_-])?(\d{10})(?:[._])?(\d{3,9})")
 
@@ -40,7 +43,7 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     stored = ImageFiles(files)
     places = (where, folder, folder.absolute().parent)
     camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
-    stamps = _stamps((where / TIMES, folder / TIMES), files, camera.fps)
+    stamps = _times_of_images([place / name for place in (where, folder) for name in TIMES], files, camera.fps)
     name = recording_name(folder)
     return RecordedSequence(
         name=name,
@@ -51,7 +54,7 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     )
 
 
-def _stamps(places: tuple[Path, ...], files: NumberedFiles, fps: float) -> FloatArray:
+def _times_of_images(places: list[Path], files: NumberedFiles, fps: float) -> FloatArray:
     """By a file, by names that are times since 1970, or at the rate of the camera."""
     path = next((path for path in places if path.exists()), None)
     if path is not None:
@@ -65,10 +68,60 @@ def _stamps(places: tuple[Path, ...], files: NumberedFiles, fps: float) -> Float
     return uniform_stamps(len(files), fps)
 
 
-def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find_folder(path: Path, asked: Asked) -> dict[str, Opener]:
     if image_folder(path) is None:
         return {}
     return {path.absolute().name: partial(open_folder, path, asked.camera)}
 
 
-LOADER = Loader("images", "images/*.png, *.jpg or *.bmp", _find)
+def open_video(path: Path, asked: Path | None) -> RecordedSequence:
+    """Open a video, turned as its rotation flag says, at the camera's frame rate or at its own frame times.
+
+    Raises:
+        DataError: if it cannot be decoded.
+        SequenceError: if it does not fit the camera.
+    """
+    folder = path.absolute().parent
+    frames = VideoFrames(path)
+    camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps)
+    return RecordedSequence(
+        name=clip_name(path),
+        images=frames,
+        camera=camera,
+        stamps=_times_of_frames(path, frames, camera.fps),
+        sources=(Source(f"folder/{video_name(path)}"),),
+    )
+
+
+def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
+    """The video's own frame times; at the camera's rate where those agree, are of another rate or unknown."""
+    even, times_s = uniform_stamps(len(frames), fps), frames.times_s()
+    rates = [frames.fps] if frames.fps else []
+    if rates and times_s is not None and len(times_s) > 1:
+        rates.append(1.0 / float(np.median(np.diff(times_s))))  # missing frames lower the mean rate alone
+    if rates and all(abs(rate / fps - 1) > _RATE_TOLERANCE for rate in rates):
+        logger.warning(
+            "%s has %.4g frames a second, the camera has %g: taken as even at the camera's rate; correct fps, unless "
+            "the video plays faster or slower than it was taken",
+            path,
+            frames.fps,
+            fps,
+        )
+        return even
+    if times_s is None:
+        return even
+    shown: FloatArray = times_s - times_s[0]
+    if np.abs(shown - even).max() * fps < _UNEVEN:
+        return even
+    logger.info("%s has %.6g frames a second: its own frame times are used", path, frames.fps)
+    return shown
+
+
+def _find_video(path: Path, asked: Asked) -> dict[str, Opener]:
+    files = [path] if path.is_file() else list_videos(path)
+    videos = (file for file in files if file.suffix.lower() in VIDEO_SUFFIXES)
+    return {clip_name(video): partial(open_video, video, asked.camera) for video in videos}
+
+
+IMAGES = Loader("images", "images/*.png, *.jpg or *.bmp", _find_folder)
+VIDEO = Loader("video", "a video", _find_video)

@@ -1,10 +1,10 @@
-"""Calibrations written by other programs: Kalibr, ROS's camera_info YAML, ORB-SLAM's settings, COLMAP's cameras.txt."""
+"""Calibrations of other programs: Kalibr, EuRoC, ROS's camera_info YAML, ORB-SLAM's settings, COLMAP's cameras.txt."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.files import read_text
@@ -14,8 +14,8 @@ from erfsfm.common.yaml_file import parse_yaml
 Keys = dict[str, Any]
 
 # names of a lens by other programs, and the model of camera.yaml
-_MODELS: dict[str | None, str] = {
-    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "PinHole"), "opencv"),
+LENSES: dict[str | None, Literal["pinhole", "opencv", "fisheye"]] = {
+    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "PinHole"), "opencv"),
     **dict.fromkeys(("equidistant", "fisheye", "KannalaBrandt8"), "fisheye"),
     **dict.fromkeys(("none", "None", "", None, "Rectified"), "pinhole"),
 }
@@ -42,15 +42,12 @@ def read_foreign_camera(path: Path, fps: float) -> CameraFile | None:
         DataError: it is such a file, but a number is missing or wrong, or its lens is unknown.
     """
     try:
-        text = read_text(path)
-        # OpenCV's "%YAML:1.0" is no directive of YAML, and its matrices have a tag
-        plain = text.partition("\n")[2].replace("!!opencv-matrix", "") if text.startswith("%") else text
-        content = None if path.suffix == ".txt" else parse_yaml(plain)
+        content = read_text(path) if path.suffix == ".txt" else read_opencv_yaml(path)
     except (OSError, UnicodeDecodeError, ErfsfmError):
         return None  # for the reader of camera.yaml to say what is wrong
     if path.suffix == ".txt":
         try:
-            return camera_of(_with_source(_colmap(text), "COLMAP", fps), str(path))
+            return camera_of(_with_source(_colmap(content), "COLMAP", fps), str(path))
         except (IndexError, ValueError, StopIteration) as error:
             raise DataError(f"{path} has no row 'CAMERA_ID MODEL WIDTH HEIGHT PARAMS...' of COLMAP: {error}") from error
     if not isinstance(content, dict):
@@ -64,16 +61,27 @@ def read_foreign_camera(path: Path, fps: float) -> CameraFile | None:
     return None
 
 
+def read_opencv_yaml(path: Path) -> Any:
+    """The content of a YAML file that OpenCV may have written, whose first line and tags are none of YAML.
+
+    Raises:
+        OSError, UnicodeDecodeError, ErfsfmError: it cannot be read.
+    """
+    text = read_text(path)
+    return parse_yaml(text.partition("\n")[2].replace("!!opencv-matrix", "") if text.startswith("%") else text)
+
+
 def _with_source(keys: Keys, program: str, fps: float) -> Keys:
     if keys["model"] == "pinhole" or (keys["model"] == "opencv" and not any(keys["distortion"])):
         keys |= {"model": "pinhole", "distortion": []}
     return {"fps": fps, **keys, "source": f"a calibration of {program}"}
 
 
-def _model(name: str | None) -> str:
-    if name not in _MODELS:
-        raise DataError(f"the lens model {name} is unknown: known are {', '.join(filter(None, _MODELS))}")
-    return _MODELS[name]
+def lens_model(name: str | None) -> Literal["pinhole", "opencv", "fisheye"]:
+    """The model of ``camera.yaml`` of a lens as another program names it; ``DataError`` where it is unknown."""
+    if name not in LENSES:
+        raise DataError(f"the lens model {name} is unknown: known are {', '.join(filter(None, LENSES))}; give --camera")
+    return LENSES[name]
 
 
 def _pinhole(width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any) -> Keys:
@@ -85,20 +93,35 @@ def _kalibr(content: Keys) -> Keys:
     if camera["camera_model"] != "pinhole":
         raise DataError(f"Kalibr's camera_model {camera['camera_model']} is unknown: calibrate as pinhole")
     keys = _pinhole(*camera["resolution"], *camera["intrinsics"])
-    return {**keys, "model": _model(camera.get("distortion_model")), "distortion": camera.get("distortion_coeffs", [])}
+    return {
+        **keys,
+        "model": lens_model(camera.get("distortion_model")),
+        "distortion": camera.get("distortion_coeffs", []),
+    }
+
+
+def _euroc(content: Keys) -> Keys:
+    if content.get("camera_model", "pinhole") != "pinhole":
+        raise DataError(f"EuRoC's camera_model {content['camera_model']} is unknown: undistort the images")
+    keys = _pinhole(*content["resolution"], *content["intrinsics"])
+    lens = {
+        "model": lens_model(content.get("distortion_model")),
+        "distortion": content.get("distortion_coefficients", []),
+    }
+    return {**keys, **lens, **({"fps": content["rate_hz"]} if "rate_hz" in content else {})}
 
 
 def _camera_info(content: Keys) -> Keys:
     fx, _, cx, _, fy, cy, *_ = content["camera_matrix"]["data"]
     keys = _pinhole(content["image_width"], content["image_height"], fx, fy, cx, cy)
     distortion = content.get("distortion_coefficients", {}).get("data", [])
-    return {**keys, "model": _model(content.get("distortion_model")), "distortion": distortion}
+    return {**keys, "model": lens_model(content.get("distortion_model")), "distortion": distortion}
 
 
 def _orb_slam(content: Keys) -> Keys:
     prefix = "Camera1" if "Camera1.fx" in content else "Camera"
     focal = (content[f"{prefix}.{name}"] for name in ("fx", "fy", "cx", "cy"))
-    model = _model(content.get("Camera.type", "PinHole"))
+    model = lens_model(content.get("Camera.type", "PinHole"))
     names = ("k1", "k2", "k3", "k4") if model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
     keys = _pinhole(content["Camera.width"], content["Camera.height"], *focal)
     keys |= {"fps": content["Camera.fps"]} if "Camera.fps" in content else {}
@@ -120,6 +143,7 @@ def _colmap(text: str) -> Keys:
 
 _PROGRAMS: dict[str, tuple[str, Callable[[Keys], Keys]]] = {
     "cam0": ("Kalibr", _kalibr),
+    "resolution": ("EuRoC", _euroc),
     "camera_matrix": ("ROS", _camera_info),
     "Camera.fx": ("ORB-SLAM", _orb_slam),
     "Camera1.fx": ("ORB-SLAM", _orb_slam),

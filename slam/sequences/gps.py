@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from erfsfm.common.files import read_text
-from slam.formats.rows import BadRows
+from slam.formats.rows import BadRows, in_seconds
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -61,7 +61,7 @@ def read_gps(path: Path) -> GpsTrack:
             + (f"; {wrong} sentences have a wrong checksum" if wrong else "")
         )
     ordered = bad.in_order(table[:, 0], "stamps", np.array([row for row, _ in good], np.intp))
-    bad.say(int(ordered.sum()), "GPS fixes")
+    bad.say(len(ordered), "GPS fixes")
     table = table[ordered]
     _require_possible_speed(table, path)
     return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4])
@@ -91,7 +91,8 @@ def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
     rows = []
     for row in reader:
         try:
-            numbers = [float(row[name]) for name in _COLUMNS] + [float(row.get("hdop") or 1.0)]
+            stamp, *place = (row[name] for name in _COLUMNS)
+            numbers = [float(word) for word in (in_seconds(stamp), *place, row.get("hdop") or 1.0)]
         except (TypeError, ValueError):
             numbers = []
         rows.append((reader.line_num, numbers))

@@ -1,15 +1,22 @@
-"""Image files of one size as the frames of a sequence; a frame whose number has no file is missing."""
+"""Image files of one size as the frames of a sequence, and depth maps beside them; some frames may have no file."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
-from erfsfm.common.readers.images import first_usual, read_image, stretch_of
+import numpy as np
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import first_usual, read_image, read_values, stretch_of
 from erfsfm.common.readers.numbering import NumberedFiles
 from slam.frames import Image
+from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import MissingFrameError, SequenceError
 
 _MAX_GAP_FRAMES = 100
+KITTI_PER_METRE = 256.0  # stored in depth maps
 
 
 class ImageSource(Protocol):
@@ -78,3 +85,24 @@ def too_long(files: NumberedFiles, first: int, last: int) -> SequenceError:
         f"no images {files.file_name(first)} to {files.file_name(last)} in {files.paths[0].parent}: a gap of "
         f"{last - first + 1} frames is too long to interpolate; split the recording there"
     )
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Files by frame, the stored value of one metre, and perhaps a value other than 0 where depth is unknown."""
+
+    paths: dict[int, Path]
+    per_metre: float = KITTI_PER_METRE
+    unknown: int = 0
+
+    def read(self, index: int) -> FloatArray:
+        """The depth map ``(h, w)`` of a frame in metres.
+
+        Raises:
+            DataError: it cannot be read, or is no 16-bit grey image.
+        """
+        path = self.paths[index]
+        values = read_values(path)
+        if values.ndim != 2 or values.dtype != np.uint16:
+            raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
+        return np.where(values == self.unknown, 0, values) / self.per_metre

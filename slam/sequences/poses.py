@@ -1,4 +1,4 @@
-"""True poses at the stamps of images, and as one file a frame."""
+"""True poses at the stamps of images: of the recording, as one file a frame, or of a file of the user."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
+from slam.formats.trajectory import other_unit, read_trajectory
 from slam.frames import runs
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -17,7 +18,7 @@ from slam.runtime.errors import SequenceError
 
 logger = logging.getLogger(__name__)
 
-_MAX_GAP_S = 0.1
+_REACH_S, _BRIDGED = (0.1, 0.3), 1.5  # bounds, and in periods of the poses
 _FARTHEST = 1e12
 _LENGTH_TOLERANCE = 0.1  # of quaternions, which are written with few digits
 _ROTATION_TOLERANCE = 0.01  # 7-Scenes writes seven digits, ScanNet six
@@ -48,25 +49,29 @@ def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
 
 
 def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path) -> FloatArray:
-    """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``.
+    """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from poses ``(M, 4, 4)`` at increasing stamps ``(M,)``.
 
-    NaN, with a warning, where the nearest known pose is more than 0.1 s away.
+    The motion goes on at both ends. NaN, with a warning, where the nearest known pose is more than 0.1 s away; of poses
+    as rare as images a missing one is bridged, up to 0.3 s.
 
-    Raises:
-        SequenceError: the stamps of the poses, which were read from ``path``, do not increase.
+    Args:
+        T_any_camera: what is known, from ``path``.
+        known: its stamps in seconds.
+        stamps: those of the images.
+        path: for the warning.
     """
     T_near = np.full((len(stamps), 4, 4), np.nan)
-    if len(known) < 2:
-        describe_unknown(T_near, path)
-        return T_near
-    if not (np.diff(known) > 0).all():
-        raise SequenceError(
-            f"{path} row {int(np.argmin(np.diff(known) > 0)) + 2}: stamps must increase; correct the row"
-        )
-    before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
-    gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
-    T_near = se3.interpolate(T_any_camera, known, stamps)
-    T_near[gap > _MAX_GAP_S] = np.nan
+    if len(known) > 1:
+        reach_s = float(np.clip(_BRIDGED * np.median(np.diff(known)), *_REACH_S))
+        first, last = np.searchsorted(known, (known[0] + reach_s, known[-1] - reach_s), side="right") - (0, 1)
+        first, last = min(first, len(known) - 1), max(last, 0)
+        before = T_any_camera[0] @ se3.invert(T_any_camera[first]) @ T_any_camera[0]
+        after = T_any_camera[-1] @ se3.invert(T_any_camera[last]) @ T_any_camera[-1]
+        reached = np.r_[2 * known[0] - known[first], known, 2 * known[-1] - known[last]]
+        T_near = se3.interpolate(np.concatenate([before[None], T_any_camera, after[None]]), reached, stamps)
+        place = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
+        gap = np.minimum(np.abs(stamps - known[place]), np.abs(known[place + 1] - stamps))
+        T_near[gap > reach_s] = np.nan
     describe_unknown(T_near, path)
     return T_near
 
@@ -92,14 +97,16 @@ def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(T_any_camera).all(axis=(1, 2)))
 
 
-def read_pose_files(paths: list[Path]) -> FloatArray:
-    """``T_any_camera`` ``(N, 4, 4)`` of files, NaN where one is missing or its numbers are not finite (tracking lost).
+def pose_files(paths: list[Path], stamps: FloatArray) -> FloatArray | None:
+    """`poses_near` of files of 4 x 4 numbers, one an image, some of which may be missing; None where all are.
+
+    Numbers that are not finite are those of a camera that lost track.
 
     Raises:
         SequenceError: a file holds other than 16 numbers, or no pose.
     """
-    T_any_camera = np.full((len(paths), 4, 4), np.nan)
-    for k, path in enumerate(paths):
+    known, poses = [], []
+    for stamp, path in zip(stamps, paths):
         if not path.exists():
             continue
         try:
@@ -110,6 +117,46 @@ def read_pose_files(paths: list[Path]) -> FloatArray:
             continue
         if not se3.is_se3(pose, _ROTATION_TOLERANCE):
             raise SequenceError(f"{path} holds no pose: its 3 x 3 part is not a rotation")
-        pose[:3, :3] = se3.nearest_rotation(pose[:3, :3])
-        T_any_camera[k] = pose
+        known.append(stamp)
+        poses.append(se3.rigid(pose))
+    if not any(path.exists() for path in paths):
+        return None
+    return poses_near(np.array(poses).reshape(-1, 4, 4), np.array(known), stamps, paths[0].parent)
+
+
+def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
+    """The true poses ``T_any_camera`` ``(N, 4, 4)`` of images at stamps ``(N,)`` in a file of trajectories, metres.
+
+    Rows with stamps belong to the frames of these times, rows with frame numbers to these frames, and others to the
+    frames one by one; NaN where unknown.
+
+    Raises:
+        SequenceError: the rows are not of its frames.
+        TrajectoryError: the file cannot be read.
+    """
+    truth, frames = read_trajectory(path), len(stamps)
+    numbers = truth.frame_numbers
+    if truth.timed:
+        T_any_camera = poses_near(truth.T_world_camera, truth.stamps, stamps, path)
+    elif truth.numbered or truth.frame_count == frames:
+        of_frame = (numbers >= 0) & (numbers < frames)
+        known = stamps[numbers[of_frame]]
+        T_any_camera = poses_near(truth.T_world_camera[of_frame], known, stamps, path)
+    else:
+        raise SequenceError(
+            f"--truth {path} has {truth.frame_count} rows and the recording {frames} frames: give each frame a row, "
+            "or rows with stamps (TUM)"
+        )
+    cure = other_unit(truth.stamps, stamps) if truth.timed else None
+    if cure or not known_poses(T_any_camera).any():
+        its, ours = (f"{numbers[0]:.3f} to {numbers[-1]:.3f}" for numbers in (truth.stamps, stamps))
+        raise SequenceError(
+            f"--truth {path} covers {its} and the recording {ours}: {cure or 'bring both to the same clock'}"
+        )
     return T_any_camera
+
+
+def poses_beside(recording: Path) -> Path | None:
+    """A file ``poses*.txt`` in or beside a recording; nothing tells whose poses they are."""
+    places = (recording, recording.absolute().parent) if recording.is_dir() else (recording.absolute().parent,)
+    return next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)

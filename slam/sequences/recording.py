@@ -7,10 +7,10 @@ Every kind of data set is opened by a function that returns a ``RecordedSequence
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from collections.abc import Sequence as Items
 from dataclasses import InitVar, dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +18,12 @@ import numpy as np
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from erfsfm.common.readers.scan import read_velodyne
-from slam.formats.rows import BadRows, number_or_nan
+from slam.formats.rows import BadRows, in_seconds, number_or_nan
 from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
-from slam.runtime.errors import SequenceError, sequence_errors
-from slam.sequences.camera_file import DEFAULT_FPS
-from slam.sequences.depth_maps import DepthMaps
+from slam.runtime.errors import SequenceError, SlamError, sequence_errors
 from slam.sequences.gps import FASTEST_M_S
-from slam.sequences.images import ImageFiles, ImageSource, too_long
+from slam.sequences.images import DepthMaps, ImageFiles, ImageSource, too_long
 from slam.sequences.poses import known_poses, rebased
 from slam.sequences.undistortion import calibrated
 
@@ -184,6 +181,37 @@ class RecordedSequence:
         return labels(self.sources, len(self))
 
 
+@dataclass
+class GrowingSequence:
+    """A sequence that grows by a frame at a time; its images are not kept."""
+
+    intrinsics: Intrinsics
+    camera_height_m: float | None
+    stamps: FloatArray = field(default_factory=lambda: np.zeros(0))
+    name: str = "live"
+    reference: FloatArray | None = None
+    T_camera_lidar: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def frame(self, index: int) -> Frame:
+        """Always ``SlamError``: images are not kept."""
+        raise SlamError(f"frame {index} of a live drive is not kept")
+
+    def has_scan(self, index: int) -> bool:
+        """False: there are no scans."""
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        """Always ``SlamError``: there are no scans."""
+        raise SlamError(f"frame {index} of a live drive has no scan")
+
+    def provenance(self) -> tuple[str, ...]:
+        """Unknown."""
+        return ()
+
+
 def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
     """Refuse stamps that cannot be seconds, such as nanoseconds, and warn of unlikely ones and of long pauses."""
     if len(stamps) < 2:
@@ -226,24 +254,22 @@ def uniform_stamps(frames: int, fps: float) -> FloatArray:
     return np.arange(frames, dtype=np.float64) / fps
 
 
-def fallback_stamps(path: Path, frames: int) -> FloatArray:
-    """Uniform stamps in place of a missing file of stamps, with a warning."""
-    logger.warning("no %s: %g frames a second are assumed", path, DEFAULT_FPS)
-    return uniform_stamps(frames, DEFAULT_FPS)
-
-
 def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
-    """A file with one time in seconds a row, checked by `require_stamps`.
+    """A file with one time in seconds a row, perhaps after a number or a name, checked by `require_stamps`.
 
     Raises:
         SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
     """
     try:
-        words = [line.strip() for line in read_text(path).splitlines() if line.strip()]
+        lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
-    stamps = np.array([number_or_nan(word) for word in words])
-    return require_stamps(stamps, path, files)
+    rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line.strip())] for line in lines]
+    has_header = files.rows_of(len(rows)) is None and files.rows_of(len(rows) - 1) is not None
+    rows = rows[has_header:]
+    first, second = (np.array([row[k] if k < len(row) else np.nan for row in rows]) for k in (0, 1))
+    is_numbered = np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()  # NaN is a name
+    return require_stamps(second if is_numbered else first, path, files)
 
 
 def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> FloatArray:
@@ -276,23 +302,15 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
 
 def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     bad, rows = BadRows(path, SequenceError), np.arange(1, len(stamps) + 1)
-    good = np.isfinite(stamps)
-    (known,) = bad.without(good, "not a time in seconds", rows)
-    good[good] = bad.in_order(stamps[good], "stamps", known)
-    bad.say(int(good.sum()) if good.sum() > 1 else 0, "times in seconds that increase, one a row")
-    if len(bad):
-        known, times = rows[good], stamps[good]
-        period = float(np.median(np.diff(times) / np.diff(known)))
-        reach = np.array([-len(rows), len(rows)])  # at both ends the rate goes on
-        times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
-        stamps = np.interp(rows, np.r_[known[0] + reach[0], known, known[-1] + reach[1]], times)
-    return stamps
-
-
-def scans_in(folder: Path, files: NumberedFiles) -> dict[int, ScanReader]:
-    """The LiDAR scans of a folder of KITTI by frame, by the numbers of the images."""
-    paths = (path for path in folder.glob("*.bin") if path.stem.isdecimal())
-    return {int(path.stem) - files.first: partial(read_velodyne, path) for path in paths}
+    rows, times = bad.without(np.isfinite(stamps), "not a time in seconds", rows, stamps)
+    order = bad.in_order(times, "stamps", rows)
+    bad.say(len(order) if len(order) > 1 else 0, "times in seconds that increase, one a row")
+    rows, times = np.sort(rows[order]), times[order]
+    period = float(np.median(np.diff(times) / np.diff(rows)))
+    reach = np.array([-len(stamps), len(stamps)])  # at both ends the rate goes on
+    times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
+    known = np.r_[rows[0] + reach[0], rows, rows[-1] + reach[1]]
+    return np.asarray(np.interp(np.arange(1, len(stamps) + 1), known, times))
 
 
 def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:

@@ -23,11 +23,15 @@ logger = logging.getLogger(__name__)
 # by kind of recording: names of pieces, the drive they are of, and their number or the time at which they begin
 _PIECES = {
     "video": (
-        re.compile(r"(?P<head>G[HX])(?P<number>\d\d)(?P<tail>\d{4})"),  # GoPro
-        re.compile(r"(?P<head>\D*)(?P<time>\d{8}_\d{6})(?P<tail>\D*)"),  # dash cams
+        re.compile(r"(?P<head>G)(?:[HXLP](?P<number>\d\d)|OPR)(?P<tail>\d{4})"),  # GoPro; the first of old ones is GOPR
+        re.compile(
+            r"(?P<head>\D*)(?P<date>\d{4}(?:[-_.]?\d\d){2})[-_ T]*(?P<clock>\d\d(?:[-_.]?\d\d){2})"
+            r"(?:[-_]\d+)?(?P<tail>\D*)"
+        ),  # dash cams
+        re.compile(r"(?P<head>.*(?:part|chapter|segment)[-_ ]?)(?P<number>\d+)(?P<tail>)"),
     ),
-    "ROS bag": (re.compile(r"(?P<head>[^/]+_)(?P<number>\d+)(?P<tail>)"),),
-    "images": (re.compile(r"(?P<head>)(?P<number>\d{3})(?P<tail>)"),),
+    "ROS bag": (re.compile(r"(?P<head>.*?_?)(?:\d{4}(?:-\d\d){5}_)?(?P<number>\d+)(?P<tail>)"),),
+    "images": (re.compile(r"(?P<head>)(?P<number>\d{3,})(?P<tail>)"),),
 }
 _NAMED_TO_S = 1.5  # names give whole seconds
 _LONGEST_PAUSE = 3.0  # times the usual distance of two pieces, before another drive begins
@@ -45,9 +49,10 @@ class _Piece:
         for pattern in _PIECES.get(kind, ()):
             if match := pattern.fullmatch(name):
                 found = match.groupdict()
-                number = int(found["number"]) if "number" in found else None
+                number = int(found["number"] or 0) if "number" in found else None
+                digits = re.sub(r"\D", "", found.get("date", "") + found.get("clock", ""))
                 try:
-                    time = datetime.strptime(found["time"], "%Y%m%d_%H%M%S") if "time" in found else None
+                    time = datetime.strptime(digits, "%Y%m%d%H%M%S") if digits else None
                 except ValueError:
                     continue
                 return cls(name, (found["head"], found["tail"]), number, time.timestamp() if time else None)

@@ -9,9 +9,9 @@ import numpy as np
 from slam.frames import Image, Intrinsics
 from slam.geometry.se3 import FloatArray
 from slam.sequences.recording import RecordedSequence, Source, uniform_stamps
+from slam.simulation.kitti_layout import simulated_world
 from slam.simulation.options import SimulationOptions
 from slam.simulation.world import SimulatedWorld
-from slam.simulation.worlds import simulated_world
 
 _CACHED_FRAMES = 32
 

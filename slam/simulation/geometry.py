@@ -1,5 +1,6 @@
-"""Triangle meshes with materials: every surface of the simulated world is a grid of quads, bent onto the terrain."""
+"""Triangle meshes with materials: every surface is a grid of quads, bent onto the terrain or moved as a whole."""
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 from enum import IntEnum
@@ -14,37 +15,12 @@ IntArray = NDArray[np.int64]
 PARAMETERS = 6
 
 
-class Material(IntEnum):
-    """Material of a surface; selects its texture."""
-
-    ASPHALT = 0
-    JUNCTION = 1
-    PAVEMENT = 2
-    KERB = 3
-    GRASS = 4
-    GRAVEL = 5
-    WALL = 6
-    ROOF = 7
-    BARK = 8
-    LEAVES = 9
-    METAL = 10
-    SIGN = 11
-    PAINT = 12
-    GLASS = 13
-    TYRE = 14
-    FENCE = 15
-    PLASTER = 16
-    TILES = 17
-    BOARDS = 18
-    CARPET = 19
-    WOOD = 20
-    FABRIC = 21
-    BOOKS = 22
-    PICTURE = 23
-    SCREEN = 24
-    PANE = 25
-    CARTON = 26
-    LAMP = 27
+Material = IntEnum(  # of a surface; selects its texture
+    "Material",
+    "ASPHALT JUNCTION PAVEMENT KERB GRASS GRAVEL WALL ROOF BARK LEAVES METAL SIGN PAINT GLASS TYRE FENCE "
+    "PLASTER TILES BOARDS CARPET WOOD FABRIC BOOKS PICTURE SCREEN PANE CARTON LAMP",
+    start=0,
+)
 
 
 @dataclass(frozen=True)
@@ -213,22 +189,65 @@ class Bend:
 FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))  # the plan as it is
 
 
-def town_bend(rng: np.random.Generator) -> Bend:
-    """Streets that sway by a few degrees over gentle hills."""
+def town_bend(rng: np.random.Generator, hills: tuple[float, float] | None = None) -> Bend:
+    """Streets that sway by a few degrees over gentle hills, or over some of a steepness and a wavelength in metres."""
     wavelengths = rng.uniform([120.0, 120.0, 140.0], [220.0, 220.0, 220.0])
-    return Bend(
-        amplitudes=np.array([*rng.uniform(0.5, 2.2, 2), rng.uniform(0.1, 0.45)]),
-        wavelengths=wavelengths,
-        phases=rng.uniform(0.0, 2.0 * np.pi, (3, 2)),
-    )
+    amplitudes = np.array([*rng.uniform(0.5, 2.2, 2), rng.uniform(0.1, 0.45)])
+    phases = rng.uniform(0.0, 2.0 * np.pi, (3, 2))
+    if hills is not None:
+        wavelengths[2] = hills[1]
+        amplitudes[2] = hills[0] * hills[1] / (2.0 * np.pi)
+        phases[2, 1] = rng.uniform(-0.35, 0.35)  # across the road at y = 0 it is at most a third as steep as along it
+    return Bend(amplitudes, wavelengths, phases)
 
 
-def road_bend(rng: np.random.Generator, start: float, end: float) -> Bend:
+def road_bend(rng: np.random.Generator, start: float, end: float, hills: tuple[float, float] | None = None) -> Bend:
     """A road whose heading wanders within about 35 degrees, radius of curvature at least about 80 m."""
-    town = town_bend(rng)
+    town = town_bend(rng, hills)
     s = np.arange(np.floor(start), np.ceil(end) + 2.0)
     heading = np.zeros_like(s)
     for wavelength, amplitude in ((rng.uniform(330.0, 480.0), 0.38), (rng.uniform(150.0, 220.0), 0.14)):
         heading += rng.uniform(0.5, 1.0) * amplitude * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 6.28))
     position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
     return Bend(town.amplitudes, town.wavelengths, town.phases, np.column_stack([position, heading]), float(s[0]))
+
+
+class Moving:
+    """Meshes around their own origins, to be placed anew at every frame."""
+
+    def __init__(self, soup: Soup, first_instances: list[int]) -> None:
+        """Things in a soup, each of which begins with one of these instances."""
+        self._mesh = soup.finish(FLAT)
+        self._thing_of_triangle = np.searchsorted(first_instances, self._mesh.instance, side="right") - 1
+
+    def placed(self, T_scene_things: dict[int, FloatArray]) -> list[Mesh]:
+        """One mesh of the things of these numbers at their poses ``(4, 4)``; none of no things."""
+        if not T_scene_things:
+            return []
+        parts = [self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()]
+        corners = np.concatenate([part.vertices for part in parts])
+        placed = dataclasses.replace(
+            self._mesh,
+            vertices=corners,
+            triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
+            uv=np.concatenate([part.uv for part in parts], axis=-1),
+            normals=np.concatenate([part.normals for part in parts], axis=-1),
+            tangents=np.concatenate([part.tangents for part in parts], axis=-1),
+            instance=np.concatenate([part.instance for part in parts]),
+            material=np.concatenate([part.material for part in parts]),
+        )
+        return [placed]
+
+    def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:
+        """The triangles of one thing, three vertices each, moved into the scene."""
+        mine = self._thing_of_triangle == number
+        R, t = T_scene_thing[:3, :3].astype(np.float32), T_scene_thing[:3, 3].astype(np.float32)
+        return dataclasses.replace(
+            self._mesh,
+            vertices=self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t,
+            uv=self._mesh.uv[..., mine],
+            normals=R @ self._mesh.normals[:, mine],
+            tangents=R @ self._mesh.tangents[:, mine],
+            instance=self._mesh.instance[mine],
+            material=self._mesh.material[mine],
+        )

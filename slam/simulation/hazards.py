@@ -7,8 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Soup
-from slam.simulation.moving import Moving
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving, Soup
 from slam.simulation.objects import car, frame_at
 from slam.simulation.route import STEP, Route
 
@@ -17,6 +16,7 @@ Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
 STILL_FRAMES = 30  # 3 s at 10 frames a second
 SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 BLUR_SAMPLES = 6
+WIDEST_LANE_M = 2.0  # from its middle to its edge
 
 
 def exposure_curve(seed: int, frames: int) -> FloatArray:
@@ -49,6 +49,14 @@ def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
     streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
     veiled = rgb * 0.85 + 0.07
     return np.asarray(veiled + streaks * (0.85 - veiled), dtype=np.float32)
+
+
+def sensed(rgb: Float32Array, vignette: float, noise: float, seed: int, index: int) -> Float32Array:
+    """An image ``(H, W, 3)`` that lacks a share of light in its corners, under noise of a deviation."""
+    y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
+    falloff = 1.0 - np.float32(0.5 * vignette) * (x * x + (y * y)[:, None])
+    grain = np.random.default_rng([seed, 35, index]).standard_normal(rgb.shape, dtype=np.float32)
+    return np.asarray(rgb * falloff[..., None] + np.float32(noise) * grain)
 
 
 def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
@@ -95,12 +103,14 @@ class Traffic:
             beside = int(rng.integers(len(self._route.sample)))
             left = rng.random() < 0.75
             speed = float(rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
-            side = self._route.lane_offset_m * float(rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9))
+            side = min(self._route.lane_offset_m, WIDEST_LANE_M) * float(
+                rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9)
+            )
             passing.append((float(self._route.sample[beside]) - speed * beside, speed, side))
         return passing
 
-    def placed(self, index: int) -> Mesh | None:
-        """The cars within sight at a frame, in the street frame; None if there are none."""
+    def placed(self, index: int) -> list[Mesh]:
+        """The cars within sight at a frame, in the street frame."""
         camera = self._route.T_street_camera[index, :3, 3]
         T_street_cars = [self._leader(index)]
         T_street_cars += [self._at(start + speed * index, left_m, -1.0) for start, speed, left_m in self._starts]

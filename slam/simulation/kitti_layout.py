@@ -1,4 +1,4 @@
-"""The files of a simulated KITTI odometry root: images, depth maps, scans, surfaces, calibration and poses."""
+"""The worlds by their options, and their files as a KITTI odometry root."""
 
 import json
 import shutil
@@ -12,10 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.formats.ply import Ply, write_ply
+from slam.formats.trajectory import Trajectory, write_kitti
 from slam.runtime.errors import SequenceError
-from slam.simulation.geometry import Float32Array, FloatArray
-from slam.simulation.options import VERSION
+from slam.simulation.geometry import FloatArray
+from slam.simulation.options import VERSION, SimulationOptions
+from slam.simulation.rooms import SimulatedRooms
+from slam.simulation.street import SimulatedStreet
 from slam.simulation.world import SimulatedWorld
+
+
+def simulated_world(options: SimulationOptions) -> SimulatedWorld:
+    """The street or the rooms of these options.
+
+    Raises:
+        SequenceError: there are too few frames for the route.
+    """
+    return SimulatedRooms(options) if options.route == "rooms" else SimulatedStreet(options)
 
 
 def write_kitti_root(
@@ -76,7 +88,8 @@ def _write_frames(
         frame = world.render(index)
         write_image(folder / "image_2" / f"{index:06d}.png", frame.image)
         if depth:
-            write_depth(folder / "depth_2" / f"{index:06d}.png", frame.depth)
+            units = np.clip(np.rint(frame.depth * 256.0), 0.0, 65535.0)
+            _write_png(folder / "depth_2" / f"{index:06d}.png", units.astype(np.uint16))
         if lidar:
             world.scan(index).astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
         if progress:
@@ -86,10 +99,15 @@ def _write_frames(
 def _write_records(world: SimulatedWorld, root: Path) -> None:
     """Calibration, times, poses, the camera and what was simulated."""
     sequence, K, options = root / "sequences" / "sim", world.K, world.options
-    write_calibration(sequence / "calib.txt", K, world.T_camera_lidar)
+    projection = _row(np.column_stack([K, np.zeros(3)]))  # the one camera stands for all four
+    rows = [f"P{camera}: {projection}" for camera in range(4)]
+    if world.T_camera_lidar is not None:
+        rows.append(f"Tr: {_row(world.T_camera_lidar[:3])}")
+    write_lines(sequence / "calib.txt", rows)
     write_lines(sequence / "times.txt", [f"{index / options.rate:.6e}" for index in range(len(world))])
     (root / "poses").mkdir()
-    write_poses(root / "poses" / "sim.txt", world.T_world_camera)
+    stamps = np.arange(len(world), dtype=np.float64)
+    write_kitti(root / "poses" / "sim.txt", Trajectory(stamps, world.T_world_camera))
     camera = {"width": options.width, "height": options.height, "fx": K[0, 0], "fy": K[1, 1]}
     camera |= {"cx": K[0, 2], "cy": K[1, 2], "fps": options.rate}
     if world.camera_height_m is not None:
@@ -103,23 +121,6 @@ def _write_records(world: SimulatedWorld, root: Path) -> None:
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     """An RGB image ``(H, W, 3)`` as PNG."""
     _write_png(path, image[..., ::-1])
-
-
-def write_depth(path: Path, depth: Float32Array) -> None:
-    """A depth map in metres ``(H, W)`` as 16-bit PNG, metres x 256."""
-    _write_png(path, np.clip(np.rint(depth * 256.0), 0.0, 65535.0).astype(np.uint16))
-
-
-def write_calibration(path: Path, K: FloatArray, T_camera_lidar: FloatArray | None) -> None:
-    """``calib.txt``: the one camera stands for all four."""
-    projection = _row(np.column_stack([K, np.zeros(3)]))
-    rows = [f"P{camera}: {projection}" for camera in range(4)]
-    write_lines(path, rows if T_camera_lidar is None else [*rows, f"Tr: {_row(T_camera_lidar[:3])}"])
-
-
-def write_poses(path: Path, T_world_camera: FloatArray) -> None:
-    """Twelve numbers a row for poses ``(N, 4, 4)``."""
-    write_lines(path, [_row(T[:3]) for T in T_world_camera])
 
 
 def write_lines(path: Path, lines: list[str]) -> None:

@@ -1,11 +1,12 @@
-"""Sun, sky and haze of one world."""
+"""Sun, sky and haze of one street, and what they make of its colours."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from slam.simulation.geometry import Float32Array
-from slam.simulation.noise import Texels, fractal
+from slam.simulation.geometry import Float32Array, Mesh
+from slam.simulation.surface import Hits, unlit
+from slam.simulation.texture import Texels, fractal
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,9 @@ class Weather:
         horizon: colour of the sky low down, and of the haze, ``(3,)``.
         clouds: cover, 0 to 1.
         visibility_m: distance at which the haze has taken 63 %.
-        exposure: gain of the camera.
+        exposure: gain of the camera; None sets it so that a share of the pixels saturates.
+        saturated: that share.
+        contrast: of textures, an exponent; 1 as they are painted.
     """
 
     sun: Float32Array
@@ -30,7 +33,9 @@ class Weather:
     horizon: Float32Array
     clouds: float
     visibility_m: float
-    exposure: float
+    exposure: float | None
+    saturated: float = 0.0
+    contrast: float = 1.0
 
 
 def draw_weather(seed: int) -> Weather:
@@ -48,6 +53,29 @@ def draw_weather(seed: int) -> Weather:
         clouds=float(rng.uniform(0.0, 1.0)),
         visibility_m=float(rng.uniform(220.0, 600.0)),
         exposure=float(rng.uniform(0.95, 1.2)),
+    )
+
+
+def draw_varied_weather(seed: int) -> Weather:
+    """Weather of a varied world: three in four have a sun beside which shadows are 3 to 10 times as dark."""
+    rng = np.random.default_rng([seed, 21])
+    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.3, 1.15)
+    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    sunny = rng.random() < 0.75
+    ambient = 1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0)))) if sunny else float(rng.uniform(0.6, 0.95))
+    bright = float(rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4))
+    blue = np.array([0.30, 0.52, 0.85]) + rng.uniform(-0.08, 0.08, 3)
+    return Weather(
+        sun=np.array(sun, dtype=np.float32),
+        sunshine=(1.0 - ambient) / np.sin(elevation),  # a level road has 1 in the sun
+        ambient=ambient,
+        zenith=(bright * blue).astype(np.float32),
+        horizon=(bright * (np.array([0.80, 0.86, 0.92]) + rng.uniform(-0.08, 0.08, 3))).astype(np.float32),
+        clouds=float(rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0)),
+        visibility_m=float(rng.uniform(300.0, 1500.0)),
+        exposure=None,
+        saturated=float(rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04)),
+        contrast=float(rng.uniform(1.2, 3.0)),
     )
 
 
@@ -78,3 +106,22 @@ def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32
     warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
     cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
     return np.asarray(direct * warm + around * cool, dtype=np.float32)
+
+
+def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px: float) -> Float32Array:
+    """Colour of each hit in the open, ``(3, N)``.
+
+    Args:
+        mesh: what was hit.
+        hits: where, sorted by material.
+        lit: 1 where the sun is seen, ``(N,)``.
+        weather: of the world.
+        focal_px: focal length in pixels.
+    """
+    rgb = unlit(mesh, hits, focal_px)
+    if weather.contrast != 1.0:
+        base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
+        rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
+    rgb *= light(weather, hits.normals, lit)
+    haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+    return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from slam.geometry import se3
-from slam.simulation.floor import Floor
 from slam.simulation.geometry import FloatArray
+from slam.simulation.house import Floor
 
 Motion = Literal["walk", "look", "phone", "drone", "robot"]
 

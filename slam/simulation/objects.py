@@ -1,5 +1,7 @@
 """Objects of a street: buildings, trees, cars, poles, signs, hedges, fences, railings and people."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from slam.simulation.geometry import FloatArray, Material, Soup
@@ -101,12 +103,12 @@ def _gable(
         soup.patch(np.stack([[a, b], [c, c]]), uv, wall)
 
 
-def tree(soup: Soup, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def tree(soup: Soup, rng: np.random.Generator, x: float, y: float, size: float, z: float = 0.0) -> None:
     """A trunk with a crown of lumpy balls, or a conifer of stacked cones."""
     bark = soup.instance(Material.BARK, colour(rng, (0.32, 0.25, 0.19), (0.42, 0.38, 0.33), spread=0.04))
     green = colour(rng, (0.20, 0.33, 0.12), (0.30, 0.40, 0.15), (0.15, 0.27, 0.14), (0.42, 0.40, 0.16), spread=0.03)
     leaves = soup.instance(Material.LEAVES, green, green * rng.uniform(0.35, 0.6))
-    foot = np.array([x, y, 0.0])
+    foot = np.array([x, y, z])
     trunk = size * float(rng.uniform(0.28, 0.42))
     lean = np.array([*rng.normal(0.0, 0.04, 2), 1.0])
     tube(soup, foot, foot + lean * (trunk + 0.25 * size), (0.035 * size, 0.02 * size), bark)
@@ -189,6 +191,36 @@ def railing(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: flo
         tube(soup, bar, bar + posts[-1] * frame[0] + 1e-3 * frame[0], (radius, radius), steel)
 
 
+def wire_fence(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float) -> None:
+    """Wooden posts and the wires between them along the frame's x axis."""
+    wood = soup.instance(Material.BARK, colour(rng, (0.42, 0.36, 0.29), (0.55, 0.52, 0.48), spread=0.03))
+    wire = soup.instance(Material.METAL, colour(rng, (0.5, 0.5, 0.5), spread=0.03))
+    height = float(rng.uniform(0.9, 1.4))
+    posts = np.arange(0.0, length, float(rng.uniform(2.0, 4.0)))
+    for along in posts:
+        foot = frame[3] + along * frame[0]
+        tube(soup, foot - 0.2 * UP, foot + height * UP, (0.05, 0.045), wood)
+    for level in np.linspace(0.95, 0.3, int(rng.integers(2, 5))):
+        for here, there in pairwise(posts):
+            up = frame[3] + level * height * UP
+            tube(soup, up + here * frame[0], up + there * frame[0], (0.008, 0.008), wire)
+
+
+def barrier(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float, concrete: bool) -> None:
+    """A wall of concrete, or a steel rail on posts, along the frame's x axis in pieces of 4 m."""
+    grey = colour(rng, (0.62, 0.61, 0.58), (0.5, 0.5, 0.5), spread=0.04)
+    look = soup.instance(Material.GRAVEL if concrete else Material.METAL, grey, 0.8 * grey)
+    for along in np.arange(0.0, length - 3.9, 4.0):
+        place = frame.copy()
+        place[3] += along * frame[0]
+        if concrete:
+            box(soup, place, np.array([0.0, -0.3, 0.0]), np.array([4.0, 0.3, 0.35]), look)
+            box(soup, place, np.array([0.0, -0.12, 0.35]), np.array([4.0, 0.12, 0.9]), look)
+        else:
+            tube(soup, place[3], place[3] + 0.75 * UP, (0.06, 0.06), look)
+            box(soup, place, np.array([0.0, -0.05, 0.45]), np.array([4.0, 0.05, 0.76]), look)
+
+
 def post(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
     """A bollard, a guide post or a mast."""
     steel = soup.instance(Material.METAL, colour(rng, (0.85, 0.85, 0.82), (0.30, 0.28, 0.26), (0.50, 0.50, 0.52)))
@@ -207,6 +239,16 @@ def person(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
         tube(soup, leg, foot + 0.5 * (leg - foot) + 0.85 * size * UP, (0.08, 0.11), trousers)
     tube(soup, foot + 0.8 * size * UP, foot + 1.45 * size * UP, (0.17, 0.21), coat)
     ball(soup, rng, foot + 1.62 * size * UP, np.array([0.11, 0.11, 0.15]), skin)
+
+
+def bonnet(soup: Soup, rng: np.random.Generator, below: float, height_m: float) -> None:
+    """The bonnet before a camera, in its frame; its far edge is seen at the slope ``below`` the axis."""
+    far = float(min(rng.uniform(1.1, 2.0), 0.6 * height_m / max(below, 0.05)))
+    x, z = np.meshgrid(np.linspace(-1.1, 1.1, 15), np.linspace(0.25, far, 8))
+    y = below * far + 0.12 * (far - z) ** 2 + 0.10 * x**2 + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
+    lacquer = colour(rng, (0.7, 0.7, 0.72), (0.08, 0.08, 0.09), (0.35, 0.36, 0.38), (0.5, 0.08, 0.08), (0.1, 0.16, 0.4))
+    paint = soup.instance(Material.METAL, lacquer)
+    soup.patch(np.stack([x, y, z], axis=2), np.stack([x, z], axis=2), paint)
 
 
 def car(soup: Soup, rng: np.random.Generator, frame: FloatArray) -> None:

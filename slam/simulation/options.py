@@ -8,7 +8,7 @@ from slam.simulation.hazards import Hazard
 from slam.simulation.motion import Motion
 from slam.simulation.route import RouteKind
 
-VERSION = 1  # of the worlds: the same options give the same bytes within a version
+VERSION = 2  # of the worlds: the same options give the same bytes within a version
 MOST_FRAMES = 100_000
 STREET_RATE = 10.0
 _MOST_PIXELS = 2**25
@@ -24,8 +24,9 @@ WORLD_KINDS: tuple[str, ...] = (*get_args(RouteKind), "rooms")
 class SimulationOptions:
     """The street or the rooms to simulate; ``seed`` determines everything else.
 
-    A ``varied`` street has another camera than KITTI's, railings and people, and cars that overtake if any move;
-    ``varied`` rooms have another focal length. ``rate``, frames a second, and ``motion`` are of rooms.
+    A ``varied`` street is a town's, an avenue, a country road or a motorway (`slam.simulation.variety`) with another
+    camera than KITTI's, hills, hard light, railings and people, and cars that overtake if any move; ``varied`` rooms
+    have another focal length. ``rate``, frames a second, and ``motion`` are of rooms.
     ``fov_deg`` is the horizontal field of view of square pixels; None is that of the world's own camera.
     """
 

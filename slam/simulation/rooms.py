@@ -7,20 +7,17 @@ from numpy.typing import NDArray
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
-from slam.simulation.floor import Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, Soup
+from slam.runtime.imports import import_open3d
+from slam.simulation.geometry import Float32Array, FloatArray, IntArray, Material, Mesh, Moving, Soup
 from slam.simulation.hazards import SHUTTER
-from slam.simulation.house import House, draw_house
+from slam.simulation.house import Floor, House, draw_house
 from slam.simulation.interior import Interior, furnish
-from slam.simulation.lighting import illuminate
 from slam.simulation.motion import Carried, carry
-from slam.simulation.moving import Moving
 from slam.simulation.objects import person
-from slam.simulation.optics import square_intrinsics
 from slam.simulation.options import SimulationOptions
-from slam.simulation.painter import Hits, unlit
-from slam.simulation.room_texture import GLOWING
-from slam.simulation.surface import Surface, place_rays
+from slam.simulation.sensors import square_intrinsics
+from slam.simulation.surface import Hits, Surface, place_rays, unlit
+from slam.simulation.texture import GLOWING
 from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
 
 STILL_S = 3.0
@@ -28,6 +25,10 @@ _USUAL_FOV_DEG, _VARIED_FOV_DEG = 65.0, (55.0, 100.0)
 _PEOPLE, _AHEAD_S, _NEAREST_M = 6, 3.5, 0.7  # the first of them walks ahead of the camera
 _GREY = 0.4  # brightness that exposure aims at
 _LONGEST_S, _METER_S, _METERED = 0.02, 0.1, 12  # exposure in the light; the meter's period, and how often it is read
+_RAYS = 48  # around a corner
+_BOUNCES = 3
+_ALBEDO = 0.55
+_REACH_M = 9.0  # of a lamp
 
 
 class SimulatedRooms(SimulatedWorld):
@@ -89,9 +90,9 @@ class SimulatedRooms(SimulatedWorld):
         poses = self._carried.poses(np.maximum(moments, 0.0)).reshape(*offsets.shape, 4, 4)
         return poses[:, 0] if offsets.shape[1] == 1 else poses
 
-    def _moving(self, index: int) -> Mesh | None:
+    def _moving(self, index: int) -> list[Mesh]:
         if self._people is None:
-            return None
+            return []
         now = index / self.options.rate
         T_scene_people = [_standing(self._carried, now + _AHEAD_S), *(_standing(walk, now) for walk in self._walks)]
         camera = self._T_scene_camera[index, :2, 3]
@@ -183,3 +184,64 @@ def _standing(walk: Carried, seconds: float) -> FloatArray:
     x, y, _, yaw, _, _ = walk.at(np.array([seconds]))[:, 0]
     c, s = np.cos(yaw), np.sin(yaw)
     return se3.make(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, -0.1]))
+
+
+def illuminate(surface: Surface, lights: FloatArray) -> Float32Array:
+    """Irradiance at the corners of triangles, about 1 below a lamp, ``(3, T)``.
+
+    Args:
+        surface: triangles that face the side that is seen.
+        lights: position and strength of each, ``(L, 4)``.
+    """
+    mesh = surface.mesh
+    triangles = mesh.triangles.astype(np.int64)
+    count = len(mesh.vertices)
+    middle, normal = np.zeros((count, 3)), np.zeros((count, 3))
+    uses = np.bincount(triangles.ravel(), minlength=count)[:, None]
+    for corner in triangles.T:
+        np.add.at(middle, corner, mesh.vertices[triangles].mean(axis=1))
+        np.add.at(normal, corner, mesh.normals.T)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    middle /= np.maximum(uses, 1)
+    points = mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal  # out of the corner, off the surface
+    direct = _direct(surface, points, normal, lights)
+    hit = _around(surface, points, normal)
+    shining = np.isin(mesh.material, [int(material) for material in GLOWING])
+    total = direct
+    for _ in range(_BOUNCES):
+        thrown = np.where(shining, 1.2, _ALBEDO * total[triangles].mean(axis=1))
+        thrown = np.append(thrown, 0.0)  # for rays that meet nothing
+        total = direct + thrown[hit].mean(axis=0)
+    return np.ascontiguousarray(total[triangles].T, dtype=np.float32)
+
+
+def _direct(surface: Surface, points: FloatArray, normals: FloatArray, lights: FloatArray) -> FloatArray:
+    """Light of the lamps that are seen from points ``(V, 3)``, ``(V,)``."""
+    total = np.zeros(len(points))
+    for x, y, z, strength in lights:
+        towards = np.array([x, y, z]) - points
+        distance = np.linalg.norm(towards, axis=1)
+        cosine = (towards * normals).sum(axis=1) / np.maximum(distance, 1e-9)
+        near = np.flatnonzero((distance < _REACH_M) & (cosine > 0.0))
+        rays = np.hstack([points[near], towards[near]]).astype(np.float32)
+        blocked = surface.scene.test_occlusions(import_open3d().core.Tensor(rays), 0.0, 0.97).numpy()
+        fade = strength * cosine[near] / (1.0 + 0.35 * distance[near] ** 2)
+        total[near] += np.where(blocked, 0.0, fade)
+    return total
+
+
+def _around(surface: Surface, points: FloatArray, normals: FloatArray) -> IntArray:
+    """Triangles that cosine-weighted rays from points ``(V, 3)`` meet, ``(_RAYS, V)``; -1 where none."""
+    turn = np.arange(_RAYS) * 2.39996  # the golden angle
+    radius = np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
+    helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    side = np.cross(normals, helper)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    other = np.cross(normals, side)
+    found = np.empty((_RAYS, len(points)), dtype=np.int64)
+    for k, (angle, r) in enumerate(zip(turn, radius)):
+        direction = r * np.cos(angle) * side + r * np.sin(angle) * other + np.sqrt(1.0 - r * r) * normals
+        answer = surface.cast(np.hstack([points, direction]).astype(np.float32))
+        met = np.isfinite(answer["t_hit"])
+        found[k] = np.where(met, answer["primitive_ids"].astype(np.int64), -1)
+    return found

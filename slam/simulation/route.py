@@ -9,7 +9,6 @@ from scipy.ndimage import gaussian_filter1d
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Bend, FloatArray, road_bend, town_bend
-from slam.simulation.optics import Mount
 from slam.simulation.streets import (
     SMALLEST_BLOCK,
     StreetPlan,
@@ -18,6 +17,7 @@ from slam.simulation.streets import (
     road_plan,
     town_plan,
 )
+from slam.simulation.variety import StreetKind, Variety
 
 RouteKind = Literal["loop", "grid", "straight"]
 
@@ -54,7 +54,9 @@ class Route:
     sample: FloatArray
 
 
-def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0, mount: Mount | None = None) -> Route:
+def plan_route(
+    route: RouteKind, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None
+) -> Route:
     """Lay out streets and a drive of ``frames`` frames over them.
 
     Args:
@@ -63,7 +65,7 @@ def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0, 
         frames: how many poses.
         seed: decides everything.
         still_frames: how long to stand still in the middle.
-        mount: of the camera; None for one like KITTI's.
+        variety: of street and camera; None for a town and a camera like KITTI's.
 
     Raises:
         SequenceError: if there are too few frames for the route.
@@ -74,16 +76,14 @@ def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0, 
     if route == "loop" and frames < FEWEST_LOOP_FRAMES:
         raise SequenceError(f"a loop closes within {FEWEST_LOOP_FRAMES} frames or more; got {frames} frames")
     stops = still_frames > 0
-    plan, bend, lane_plan = _layout(route, moving, seed, stops)
+    plan, bend, lane_plan = _layout(route, moving, seed, stops, variety)
     arrival = _arrival(bend, lane_plan, stops, moving)
     if route == "loop":
         arrival *= (moving - 1.0) / arrival[-1]
     rng = np.random.default_rng([seed, 2])
-    camera_height_m, pitch = float(rng.uniform(1.5, 1.8)), None
-    if mount is not None:
-        camera_height_m, pitch = mount.height_m, mount.pitch
+    camera_height_m = float(rng.uniform(1.5, 1.8)) if variety is None else variety.height_m
     sample = np.interp(np.arange(moving), arrival, np.arange(len(arrival)))
-    T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m, pitch)
+    T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m, variety)
     if stops:
         rest = int(np.argmin(np.diff(sample)))
         order = np.insert(np.arange(moving), rest, [rest] * still_frames)
@@ -92,27 +92,31 @@ def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0, 
     return Route(plan, bend, T_street_camera, camera_height_m, lane_street, _lane_offset(plan, seed), sample)
 
 
-def _layout(route: RouteKind, moving: int, seed: int, stops: bool) -> tuple[StreetPlan, Bend, FloatArray]:
+def _layout(
+    route: RouteKind, moving: int, seed: int, stops: bool, variety: Variety | None
+) -> tuple[StreetPlan, Bend, FloatArray]:
     """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
     rng = np.random.default_rng([seed, 0])
+    kind: StreetKind = "town" if variety is None else variety.kind
+    hills = None if variety is None else (variety.steepness, variety.wavelength_m)
     if route == "straight":
         end = START + 1.25 * moving + 5.0
-        plan = road_plan(rng, end)
-        bend = road_bend(np.random.default_rng([seed, 1]), plan.xs[0] - 200.0, plan.xs[-1] + 200.0)
+        plan = road_plan(rng, end, kind)
+        bend = road_bend(np.random.default_rng([seed, 1]), plan.xs[0] - 200.0, plan.xs[-1] + 200.0, hills)
         return plan, bend, _lane(plan, seed)[int(START / STEP) : int(end / STEP)]
-    bend = town_bend(np.random.default_rng([seed, 1]))
+    bend = town_bend(np.random.default_rng([seed, 1]), hills)
     if route == "grid":
         side = 3 if moving < 500 else 4 if moving < 1200 else 5
         spacing = 24.0 if moving < 330 else 30.0 if moving < 500 else 40.0 if moving < 1200 else 52.0
         walk = grid_walk(rng, side, int(0.95 * moving / spacing), spare=int(0.35 * moving / spacing) + 2)
-        plan = town_plan(rng, walk, spacing, side_streets=0.6)
+        plan = town_plan(rng, walk, spacing, side_streets=0.6, kind=kind)
         return plan, bend, _lane(plan, seed)[int(5.0 / STEP) :]
     edges = max(8, 2 * round((0.95 * moving - OVERLAP) / 84.0))
     spacing = 36.0
     for _ in range(8):
         rng = np.random.default_rng([seed, 0])
         cycle = loop_cycle(rng, edges)
-        plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35)
+        plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35, kind=kind)
         lane_plan = _loop_lane(plan, seed)
         stretch = (moving - 1.0) / _arrival(bend, lane_plan, stops, moving)[-1]
         if abs(stretch - 1.0) < 0.004:
@@ -209,11 +213,11 @@ def _poses(
     lane_plan: FloatArray,
     sample: FloatArray,
     camera_height_m: float,
-    pitch: float | None,
+    variety: Variety | None,
 ) -> FloatArray:
     """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, with suspension.
 
-    Without a ``pitch`` it is drawn, as of a camera that was mounted level.
+    Without a ``variety`` the camera was mounted level but for a little pitch.
     """
     rows = np.arange(len(lane_plan))
     direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
@@ -230,7 +234,10 @@ def _poses(
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
     suspension = _suspension(rng, len(at))
-    suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8)) if pitch is None else -pitch
+    if variety is None:
+        suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
+    else:
+        suspension[:, [0, 2]] += -variety.pitch, variety.roll
     position = bend(at) - (camera_height_m + suspension[:, 3:]) * down
     T_street_level = se3.make(np.stack([right, down, forward], axis=2), position)
     return T_street_level @ se3.from_rotation_vector(suspension[:, :3], np.zeros((len(at), 3)))

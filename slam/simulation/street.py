@@ -3,6 +3,7 @@
 Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/simulation``).
 """
 
+import functools
 from typing import cast
 
 import cv2
@@ -11,17 +12,19 @@ from numpy.typing import NDArray
 
 from slam.runtime.imports import import_open3d
 from slam.simulation import hazards as effects
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving, Soup
 from slam.simulation.hazards import Traffic
-from slam.simulation.lidar import T_CAMERA_LIDAR, beam_directions, measured
-from slam.simulation.light import draw_weather, sky
-from slam.simulation.optics import draw_mount, kitti_intrinsics, square_intrinsics
+from slam.simulation.light import draw_varied_weather, draw_weather, paint, sky
+from slam.simulation.objects import bonnet
 from slam.simulation.options import SimulationOptions
-from slam.simulation.painter import Hits, paint
 from slam.simulation.route import RouteKind, plan_route
-from slam.simulation.surface import Surface, place_rays
+from slam.simulation.sensors import T_CAMERA_LIDAR, beam_directions, kitti_intrinsics, measured, square_intrinsics
+from slam.simulation.surface import Hits, Surface, place_rays
 from slam.simulation.town import build_town
+from slam.simulation.variety import draw_variety
 from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
+
+_DARKEST_MEAN = 0.33  # of an image, to which a camera exposes at least
 
 
 class SimulatedStreet(SimulatedWorld):
@@ -38,16 +41,17 @@ class SimulatedStreet(SimulatedWorld):
         """
         K = kitti_intrinsics(options.width, options.height)
         still = effects.STILL_FRAMES if "stop" in options.hazards else 0
-        mount = draw_mount(options.seed) if options.varied else None
-        if mount is not None:
-            K[[0, 1], [0, 1]] *= mount.zoom
+        variety = draw_variety(options.seed, options.route == "straight") if options.varied else None
+        if variety is not None:
+            K = variety.intrinsics(options.width, options.height)
         if options.fov_deg is not None:
             K = square_intrinsics(options.width, options.height, options.fov_deg)
-        self._route = plan_route(cast(RouteKind, options.route), options.frames, options.seed, still, mount)
+        self._route = plan_route(cast(RouteKind, options.route), options.frames, options.seed, still, variety)
         super().__init__(options, K, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
         self.T_camera_lidar = T_CAMERA_LIDAR.copy()
-        self._weather = draw_weather(options.seed)
+        self._variety = variety
+        self._weather = draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
         self._exposure = effects.exposure_curve(options.seed, options.frames)
         self._traffic = Traffic(self._route, options.seed, options.varied) if "moving-cars" in options.hazards else None
 
@@ -71,8 +75,30 @@ class SimulatedStreet(SimulatedWorld):
     def _build(self) -> Mesh:
         return build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied)
 
-    def _moving(self, index: int) -> Mesh | None:
-        return self._traffic.placed(index) if self._traffic else None
+    def _moving(self, index: int) -> list[Mesh]:
+        cars = self._traffic.placed(index) if self._traffic else []
+        return cars + (self._bonnet.placed({0: self._route.T_street_camera[index]}) if self._bonnet else [])
+
+    @functools.cached_property
+    def _bonnet(self) -> Moving | None:
+        """The bonnet of the own car; none under motion blur, which would smear it against the camera."""
+        if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
+            return None
+        rng = np.random.default_rng([self.options.seed, 12])
+        soup = Soup(rng)
+        below = (self.options.height * (1.0 - self._variety.bonnet) - self.K[1, 2]) / self.K[1, 1]
+        bonnet(soup, rng, float(below), self.camera_height_m)
+        return Moving(soup, [0])
+
+    @functools.cached_property
+    def _gain(self) -> float:
+        """Of the camera, constant over the drive."""
+        if self._weather.exposure is not None:
+            return self._weather.exposure
+        frames = (0, len(self) // 2, len(self) - 1)
+        views = [self._view(self._surfaces(index), self._route.T_street_camera[index])[0] for index in frames]
+        brightest = float(np.quantile(np.max(views, axis=-1), 1.0 - self._weather.saturated))
+        return max(1.0 / brightest, _DARKEST_MEAN / float(np.mean(np.minimum(views, brightest))))
 
     def _exposures(self, index: int) -> FloatArray:
         if "blur" in self.options.hazards:
@@ -105,10 +131,12 @@ class SimulatedStreet(SimulatedWorld):
 
     def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
         """Rain, lens blur, exposure, and quantisation to 8 bits."""
-        rgb = rgb * np.float32(self._weather.exposure)
+        rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
             rgb = effects.rained_on(rgb, self.options.seed, index)
-        rgb = through_lens(rgb)
+        rgb = through_lens(rgb) if self._variety is None else through_lens(rgb, self._variety.blur_px)
         if "exposure" in self.options.hazards:
             rgb = effects.exposed(rgb, float(self._exposure[index, 0]), float(self._exposure[index, 1]))
+        if self._variety is not None:
+            rgb = effects.sensed(rgb, self._variety.vignette, self._variety.noise, self.options.seed, index)
         return in_bytes(rgb)

@@ -7,12 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.simulation.geometry import FloatArray
+from slam.simulation.variety import StreetKind
 
 Node = tuple[int, int]
 BoolArray = NDArray[np.bool_]
 
 MARGIN = 42.0  # depth of the outermost lots, metres
 SMALLEST_BLOCK = 22.0  # between two street centres, metres
+_ROADS: dict[StreetKind, tuple[float, float, float, tuple[float, float]]] = {  # blocks, side streets, half width
+    "town": (38.0, 85.0, 0.45, (4.6, 5.2)),
+    "avenue": (50.0, 110.0, 0.3, (4.6, 7.0)),
+    "country": (90.0, 180.0, 0.3, (2.9, 4.2)),
+    "motorway": (120.0, 200.0, 0.0, (9.0, 14.0)),
+}
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,7 @@ class StreetPlan:
         along_y: whether the edge from node (i, j) to (i, j + 1) is a street, ``(X, Y - 1)``.
         half_width: of every street, metres.
         drive: nodes in the order in which the camera passes them.
+        kind: of streets and what stands beside them.
     """
 
     xs: FloatArray
@@ -34,6 +42,7 @@ class StreetPlan:
     along_y: BoolArray
     half_width: float
     drive: tuple[Node, ...]
+    kind: StreetKind = "town"
 
     def node(self, node: Node) -> FloatArray:
         """Plan position of a node, ``(2,)``."""
@@ -99,7 +108,9 @@ def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> li
     return best[1]
 
 
-def town_plan(rng: np.random.Generator, drive: list[Node], spacing: float, side_streets: float) -> StreetPlan:
+def town_plan(
+    rng: np.random.Generator, drive: list[Node], spacing: float, side_streets: float, kind: StreetKind = "town"
+) -> StreetPlan:
     """Lay streets under a drive, and some more beside it.
 
     Args:
@@ -107,6 +118,7 @@ def town_plan(rng: np.random.Generator, drive: list[Node], spacing: float, side_
         drive: nodes to pass, smallest coordinates zero.
         spacing: mean distance between parallel streets, metres.
         side_streets: probability that an edge which is not driven is a street.
+        kind: of streets.
     """
     span = np.max(drive, axis=0)
     lines = [_lines(rng, int(count), spacing) for count in span]
@@ -119,21 +131,22 @@ def town_plan(rng: np.random.Generator, drive: list[Node], spacing: float, side_
     for a, b in pairwise(shifted):
         low = min(a, b)
         (along_x if a[1] == b[1] else along_y)[low] = True
-    return StreetPlan(lines[0], lines[1], along_x, along_y, half_width, tuple(shifted))
+    return StreetPlan(lines[0], lines[1], along_x, along_y, half_width, tuple(shifted), kind)
 
 
-def road_plan(rng: np.random.Generator, length: float) -> StreetPlan:
+def road_plan(rng: np.random.Generator, length: float, kind: StreetKind = "town") -> StreetPlan:
     """One street along x with side streets, long enough to drive ``length`` metres."""
-    gaps = rng.uniform(38.0, 85.0, int(length / 38.0) + 3)
+    shortest, longest, side_streets, widths = _ROADS[kind]
+    gaps = rng.uniform(shortest, longest, int(length / shortest) + 3)
     ends = np.cumsum(gaps)
     xs = np.concatenate([[0.0], ends[: int(np.searchsorted(ends, length + 160.0)) + 1]])
     ys = np.array([-MARGIN, 0.0, MARGIN])
     along_x = np.zeros((len(xs) - 1, 3), dtype=bool)
     along_x[:, 1] = True
-    along_y = rng.random((len(xs), 2)) < 0.45
+    along_y = rng.random((len(xs), 2)) < side_streets
     along_y[[0, -1], :] = False
     drive = tuple((i, 1) for i in range(len(xs)))
-    return StreetPlan(xs, ys, along_x, along_y, float(rng.uniform(4.6, 5.2)), drive)
+    return StreetPlan(xs, ys, along_x, along_y, float(rng.uniform(*widths)), drive, kind)
 
 
 def _lines(rng: np.random.Generator, count: int, spacing: float) -> FloatArray:

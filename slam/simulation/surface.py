@@ -1,4 +1,4 @@
-"""Surfaces that rays meet, cast with Open3D."""
+"""Surfaces that rays meet, cast with Open3D, and their colour where they are met."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
+from slam.simulation.sensors import footprint
+from slam.simulation.texture import Texels, shade
 
 
 @dataclass(frozen=True)
@@ -56,3 +58,51 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
     rays[:, :3] = T_scene_sensor[:3, 3]
     rays[:, 3:] = directions @ T_scene_sensor[:3, :3].T.astype(np.float32)
     return rays
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Rays that met a mesh, sorted by material.
+
+    Attributes:
+        triangle: which, ``(N,)``.
+        barycentric: weights of its second and third corner, ``(2, N)``.
+        rays: unit directions in the mesh's frame, ``(3, N)``.
+        normals: unit, turned towards the viewer, ``(3, N)``.
+        depth: z-depth, metres, ``(N,)``.
+        distance: along the ray, metres, ``(N,)``.
+    """
+
+    triangle: NDArray[np.int64]
+    barycentric: Float32Array
+    rays: Float32Array
+    normals: Float32Array
+    depth: Float32Array
+    distance: Float32Array
+
+
+def facing_normals(mesh: Mesh, triangle: NDArray[np.int64], rays: Float32Array) -> Float32Array:
+    """Unit normals of triangles ``(N,)`` turned against rays ``(3, N)``, ``(3, N)``."""
+    normals = np.take(mesh.normals, triangle, axis=1)
+    return np.asarray(normals * -np.sign((normals * rays).sum(axis=0)))
+
+
+def unlit(mesh: Mesh, hits: Hits, focal_px: float) -> Float32Array:
+    """Colour of each hit under white light, ``(3, N)`` at a focal length in pixels."""
+    tangents = np.take(mesh.tangents, hits.triangle, axis=1)
+    u_size, v_size = footprint(hits.depth / np.float32(focal_px), hits.rays, hits.normals, tangents)
+    corners = np.take(mesh.uv, hits.triangle, axis=2)  # (3, 2, N)
+    b1, b2 = hits.barycentric
+    u, v = corners[0] + b1 * (corners[1] - corners[0]) + b2 * (corners[2] - corners[0])
+    instance = np.take(mesh.instance, hits.triangle)
+    offsets = np.take(mesh.offsets, instance, axis=1)
+    counts = np.bincount(np.take(mesh.material, hits.triangle), minlength=len(Material))
+    ends = np.cumsum(counts)
+    rgb = np.empty((3, len(hits.triangle)), dtype=np.float32)
+    for kind in np.flatnonzero(counts):
+        part = slice(int(ends[kind] - counts[kind]), int(ends[kind]))
+        texels = Texels(u[part], v[part], u_size[part], v_size[part], offsets[0, part], offsets[1, part])
+        colours = np.take(mesh.colours, instance[part], axis=2)
+        parameters = np.take(mesh.parameters, instance[part], axis=1)
+        rgb[:, part] = shade(Material(kind), texels, colours, parameters)
+    return rgb

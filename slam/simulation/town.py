@@ -7,6 +7,7 @@ from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
 from slam.simulation.streets import StreetPlan
 
 KERB = 0.13  # height of pavements above the road, metres
+LANE = 3.6  # width on a motorway, metres
 ROUNDING = 5.0  # radius of kerbs at corners, metres
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
@@ -19,6 +20,8 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
     for i in range(len(plan.xs) - 1):
         for j in range(len(plan.ys) - 1):
             town.block(i, j)
+    if plan.kind == "motorway":
+        town.median()
     town.backdrop()
     return town.soup.finish(bend)
 
@@ -32,19 +35,28 @@ class _Town:
         self.parking = float(rng.uniform(0.1, 0.6))  # of cars along the kerb
         self.greenery = float(rng.uniform(0.25, 0.8))
         self.pavement_width = float(rng.uniform(1.6, 2.4))
+        self.tallness = 1.0  # of trees at the kerb
+        self.open = plan.kind in ("country", "motorway")  # no houses, no pavements
+        self.foot = KERB - (0.1 if more is None else 0.6)  # of houses, below the ground on hills
         grey = objects.colour(rng, (0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03)
         stone = objects.colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
         turf = objects.colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
         paint = np.array([0.80, 0.80, 0.76])
         dash, fraction, edged = rng.uniform(3.0, 6.0), rng.uniform(0.35, 0.6), rng.random() < 0.7
-        lines = (plan.half_width, float(dash), float(fraction), float(edged))
+        lanes = LANE if plan.kind == "motorway" else 0.0
+        smooth = 0.0 if more is None else float(more.uniform(0.2, 0.85))
+        lines = (plan.half_width, float(dash), float(fraction), float(edged), lanes, smooth)
         soup = self.soup
         self.asphalt = soup.instance(Material.ASPHALT, grey, paint, lines)
-        self.junction = soup.instance(Material.JUNCTION, grey, paint)
+        self.junction = soup.instance(Material.JUNCTION, grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth))
         self.pavement = soup.instance(Material.PAVEMENT, stone, 0.7 * stone, (float(rng.uniform(0.5, 1.2)),))
         self.kerb = soup.instance(Material.KERB, 1.15 * stone, 0.6 * stone, (1.0,))
         self.grass = soup.instance(Material.GRASS, turf, 0.55 * turf)
         self.gravel = soup.instance(Material.GRAVEL, 0.9 * stone, 0.5 * stone)
+        if self.open:
+            self.pavement = self.kerb = self.grass if rng.random() < 0.6 else self.gravel
+        if plan.kind == "avenue":
+            self.greenery, self.tallness = 2.0, 1.6
 
     def ground(self) -> None:
         """Roads, junctions, and a wide meadow under it all."""
@@ -100,6 +112,11 @@ class _Town:
         points = self._grid(rectangle, z, step)
         self.soup.patch(points, points[..., :2], instance)
 
+    def median(self) -> None:
+        """The barrier between the carriageways of a motorway."""
+        start, end = float(self.plan.xs[0]), float(self.plan.xs[-1])
+        objects.barrier(self.soup, self.rng, objects.frame_at(start, 0.0, 0.0), end - start, self.rng.random() < 0.5)
+
     def block(self, i: int, j: int) -> None:
         """One cell of the grid: pavement with kerbs around it, lots inside."""
         plan, half = self.plan, self.plan.half_width
@@ -114,6 +131,9 @@ class _Town:
         width = self.pavement_width
         inner = (x0 + width, y0 + width, x1 - width, y1 - width)
         self._pavement((x0, y0, x1, y1), inner, sides)
+        if self.open:
+            self._field((x0, y0, x1, y1), inner, sides)
+            return
         self._slab(inner, KERB, self.grass if self.rng.random() < 0.7 else self.gravel)
         corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
         for side, street in enumerate(sides):
@@ -162,7 +182,7 @@ class _Town:
             spot = start + along * ahead + float(rng.uniform(0.55, 1.0)) * inward
             kind = rng.random()
             if kind < 0.45 * self.greenery:
-                objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(4.0, 8.0)))
+                objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(4.0, 8.0)) * self.tallness)
             elif kind < 0.55:
                 objects.lamp(self.soup, rng, spot[0], spot[1], -inward)
             elif kind < 0.72:
@@ -192,6 +212,65 @@ class _Town:
             else:
                 objects.post(self.soup, rng, float(spot[0]), float(spot[1]))
 
+    def _field(self, outer: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
+        """Open land that may rise beside the road to a bank, with trees, bushes, hedges, fences or barriers."""
+        rng, soup = self.rng, self.soup
+        rise, run = max(0.0, float(rng.uniform(-3.0, 5.0))), float(rng.uniform(3.0, 10.0))
+        low, high = np.array(inner[:2]), np.array(inner[2:])
+
+        def ground(x: FloatArray, y: FloatArray) -> FloatArray:
+            inwards = np.minimum(np.minimum(x - low[0], high[0] - x), np.minimum(y - low[1], high[1] - y))
+            part = np.clip(inwards / run, 0.0, 1.0)
+            return np.asarray(KERB + rise * part * part * (3.0 - 2.0 * part))
+
+        points = self._grid(inner, 0.0, 2.0)
+        points[..., 2] = ground(points[..., 0], points[..., 1])
+        crop = objects.colour(rng, (0.30, 0.36, 0.14), (0.55, 0.47, 0.26), (0.34, 0.27, 0.20), (0.24, 0.34, 0.13))
+        land = self.grass if rng.random() < 0.4 else soup.instance(Material.GRASS, crop, 0.6 * crop)
+        soup.patch(points, points[..., :2], land)
+        wood = float(rng.choice([0.0, 1.0, 4.0, 10.0]))  # trees in 100 square metres near the road
+        corners = [np.array(corner) for corner in ((low[0], low[1]), (high[0], low[1]), high, (low[0], high[1]))]
+        for side in (side for side in range(4) if sides[side]):
+            start, end = corners[side], corners[(side + 1) % 4]
+            length = float(np.linalg.norm(end - start))
+            ahead = (end - start) / length
+            inward = np.array([-ahead[1], ahead[0]])
+            angle = float(np.arctan2(ahead[1], ahead[0]))
+            frame = objects.frame_at(start[0], start[1], angle, KERB)
+            for _ in range(int(rng.poisson(0.15 * wood * length))):
+                far = 15.0 * rng.random() ** 1.5
+                x, y = start + rng.uniform(0.0, length) * ahead + far * inward
+                z = float(ground(np.array(x), np.array(y)))
+                if rng.random() < 0.4:
+                    green = objects.colour(rng, (0.20, 0.30, 0.12), (0.32, 0.34, 0.16), (0.14, 0.24, 0.10), spread=0.03)
+                    bush = soup.instance(Material.LEAVES, green, 0.45 * green)
+                    size = float(rng.uniform(0.5, 1.8))
+                    objects.ball(soup, rng, np.array([x, y, z + 0.4 * size]), np.array([1.0, 1.0, 0.8]) * size, bush)
+                elif far > 1.5:
+                    objects.tree(soup, rng, float(x), float(y), float(rng.uniform(4.0, 13.0)), z - 0.2)
+            self._edge(frame, length)
+
+    def _edge(self, frame: FloatArray, length: float) -> None:
+        """What stands between a road and the open land beside it."""
+        rng, soup, kind = self.rng, self.soup, self.rng.random()
+        if self.plan.kind == "motorway":
+            if kind < 0.75:
+                objects.barrier(soup, rng, frame, length, kind < 0.25)
+            elif kind < 0.87:  # against the noise
+                stone = objects.colour(rng, (0.55, 0.53, 0.48), (0.40, 0.45, 0.40), (0.45, 0.38, 0.30))
+                wall = soup.instance(Material.BOARDS, stone, 0.6 * stone, (0.5,))
+                objects.box(soup, frame, np.zeros(3), np.array([length, 0.3, float(rng.uniform(2.5, 5.0))]), wall)
+        elif kind < 0.3:
+            objects.wire_fence(soup, rng, frame, length)
+        elif kind < 0.4:
+            objects.hedge(soup, rng, frame, length)
+        elif kind < 0.6:
+            for along in np.arange(3.0, length, float(rng.uniform(7.0, 14.0))):
+                x, y, _ = frame[3] + along * frame[0] + 0.5 * frame[1]
+                objects.tree(soup, rng, float(x), float(y), float(rng.uniform(6.0, 12.0)))
+        elif kind < 0.75:
+            objects.barrier(soup, rng, frame, length, False)
+
     def _split(self, lot: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
         """Cut a lot in two until each piece is of the size of a house."""
         x0, y0, x1, y1 = lot
@@ -220,7 +299,7 @@ class _Town:
             gap = float(rng.choice([0.02, rng.uniform(0.4, 1.6)]))
             corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
             width, depth = (x1 - x0, y1 - y0) if side % 2 == 0 else (y1 - y0, x1 - x0)
-            frame = objects.frame_at(*corners[side], side * np.pi / 2.0, KERB - 0.1)
+            frame = objects.frame_at(*corners[side], side * np.pi / 2.0, self.foot)
             frame[3] += gap * frame[0] + front * frame[1]
             deep = min(depth - front - 0.2, float(rng.uniform(7.0, 14.0)))
             objects.building(self.soup, rng, frame, width - 2 * gap, deep)
@@ -249,7 +328,7 @@ class _Town:
             outward = np.array([ahead[1], -ahead[0]])
             for along in np.arange(0.0, float(np.linalg.norm(end - start)), 9.0):
                 spot = start + (along + rng.uniform(-3, 3)) * ahead + rng.uniform(6.0, 25.0) * outward
-                if rng.random() < 0.7:
+                if rng.random() < (1.0 if self.open else 0.7):
                     objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(6.0, 13.0)))
                 else:
                     frame = objects.frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)

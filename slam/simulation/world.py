@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from slam.geometry import se3
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh
-from slam.simulation.optics import pixel_rays
 from slam.simulation.options import SimulationOptions
-from slam.simulation.painter import Hits, facing_normals
-from slam.simulation.surface import Surface, distances, place_rays
+from slam.simulation.sensors import pixel_rays
+from slam.simulation.surface import Hits, Surface, distances, facing_normals, place_rays
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 
@@ -66,8 +65,8 @@ class SimulatedWorld(ABC):
         """Every surface that stands still."""
 
     @abstractmethod
-    def _moving(self, index: int) -> Mesh | None:
-        """What moves, as it is at a frame; None where nothing does."""
+    def _moving(self, index: int) -> list[Mesh]:
+        """What moves, as it is at a frame."""
 
     @abstractmethod
     def _background(self, directions: Float32Array) -> Float32Array:
@@ -132,8 +131,7 @@ class SimulatedWorld(ABC):
 
     def _surfaces(self, index: int) -> list[Surface]:
         """The surfaces at a frame: what stands still, and what moves."""
-        moving = self._moving(index)
-        return [self._still] if moving is None else [self._still, Surface.of(moving)]
+        return [self._still, *map(Surface.of, self._moving(index))]
 
     def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or from one of each row."""
@@ -168,9 +166,9 @@ class SimulatedWorld(ABC):
             raise IndexError(f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}")
 
 
-def through_lens(rgb: Float32Array) -> Float32Array:
+def through_lens(rgb: Float32Array, blur_px: float = 0.55) -> Float32Array:
     """An image as blurred as a lens blurs it."""
-    return np.asarray(cv2.GaussianBlur(rgb, (3, 3), 0.55))
+    return np.asarray(cv2.GaussianBlur(rgb, (3, 3), blur_px))
 
 
 def in_bytes(rgb: Float32Array) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.localisation.localiser import localise
+from slam.commands.localisation import localise
 from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import invert
 

@@ -24,8 +24,8 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import ESSENTIAL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
+from slam.pipeline.run import SlamPipeline
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root

@@ -20,7 +20,7 @@ from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import from_rotation_vector, invert
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics, ScaleMetrics, SequenceMetrics
-from slam.runtime.storage.record import Missing
+from slam.runtime.attempt import Failed
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
@@ -75,7 +75,7 @@ def cells(table: str) -> list[list[str]]:
 
 def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any) -> None:
     results = results_of(job, {"default": [1.0, 3.0]})
-    results.append(work.JobResult(replace(job, seed=2), Missing("out of memory"), "abc", "out of memory"))
+    results.append(work.JobResult(replace(job, seed=2), Metrics(), "abc", "out of memory"))
     text = page.accuracy_tables(results)
     *_, head, row = cells(text)
     assert row[head.index("ATE 7-dof, optimised")] == "2.00 ± 1.41"
@@ -91,9 +91,9 @@ def test_errors_relative_to_path_and_network(tmp_path: Path) -> None:
     derived = work.derive_metrics(tmp_path, run)
     shares = derived.network_percent, derived.optimised_percent, derived.of_network
     assert shares == pytest.approx((4.0, 1.0, 0.25))
-    assert derived.false_loops == Missing("the sequence has no true poses")
-    run = run.changed(sequence=SequenceMetrics(length_m=Missing("no truth")))
-    assert work.derive_metrics(tmp_path, run).optimised_percent == Missing("no truth")
+    assert derived.false_loops is None
+    run = run.changed(sequence=SequenceMetrics.of(length_m=Failed("no truth")))
+    assert work.derive_metrics(tmp_path, run).optimised_percent is None
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float,
     derived = work.derive_metrics(tmp_path, metrics())
     assert (derived.true_loops, derived.false_loops) == (1 - false, false)
     in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
-    assert isinstance(work.derive_metrics(tmp_path, in_heights).true_loops, Missing)
+    assert work.derive_metrics(tmp_path, in_heights).true_loops is None
 
 
 def test_ablation_compares_with_the_same_seed(job: Any) -> None:
@@ -121,9 +121,9 @@ def test_ablation_compares_with_the_same_seed(job: Any) -> None:
     assert table[-2:] == [["everything on", "1.50"], ["no loops", "3.00"]]
 
 
-def test_a_number_that_is_missing_has_its_reason_below(job: Any) -> None:
+def test_a_number_that_is_missing_is_named_below(job: Any) -> None:
     text = page.maps_tables(results_of(job, {plan.EVERYTHING.name: [1.0]}))
-    assert "– map triangles, loop 610: no map." in text
+    assert "– map triangles, loop 610: not known." in text
 
 
 @pytest.mark.slow

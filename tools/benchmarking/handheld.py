@@ -16,11 +16,9 @@ from benchmarking.work import JobResult, ratio
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.runtime.storage.record import Missing
 from slam.sequences.catalogue import open_sequence, sequence_kinds
-from slam.sequences.poses import known_poses
+from slam.sequences.poses import known_poses, poses_beside
 from slam.sequences.recording import RecordedSequence
-from slam.sequences.truth import poses_beside
 from slam.simulation.motion import Motion
 from slam.simulation.options import VERSION, RoomHazard
 
@@ -90,52 +88,48 @@ def _room(
 
 
 @functools.cache
-def _error_and_path(run: Path, drive: BenchmarkSequence) -> tuple[float | Missing, float | Missing]:
+def _error_and_path(run: Path, drive: BenchmarkSequence) -> tuple[float | None, float | None]:
     """7-dof ATE of the optimised trajectory, and the path, by those frames whose true pose is known, metres."""
     sequence = open_sequence(drive.root, drive.sequence or None, truth=drive.truth)
     poses = sequence.T_any_camera if isinstance(sequence, RecordedSequence) else None
     known = np.zeros(0, np.intp) if poses is None else np.flatnonzero(known_poses(poses))
     estimate = RunFolder(run).trajectory("optimised")
     if poses is None or estimate is None or not len(known):
-        return Missing("it has no true poses"), Missing("it has no true poses")
+        return None, None
     truth = Trajectory(sequence.stamps[known], poses[known]).rebased()
-    ate: float | Missing = trajectory_metrics(estimate.select(known).rebased(), truth).align.dof7.ate_rmse_m
+    ate: float | None = trajectory_metrics(estimate.select(known).rebased(), truth).align.dof7.ate_rmse_m
     return ate, truth.length_m
 
 
-def _ate(o: JobResult) -> float | Missing:
-    return _error_and_path(o.job.place / "run", o.job.drive)[0] if not o.reason else Missing(o.reason)
+def _ate(o: JobResult) -> float | None:
+    return _error_and_path(o.job.place / "run", o.job.drive)[0] if not o.reason else None
 
 
-def _path(o: JobResult) -> float | Missing:
-    return _error_and_path(o.job.place / "run", o.job.drive)[1] if not o.reason else Missing(o.reason)
+def _path(o: JobResult) -> float | None:
+    return _error_and_path(o.job.place / "run", o.job.drive)[1] if not o.reason else None
 
 
-def losses(o: JobResult) -> int | Missing:
+def losses(o: JobResult) -> int | None:
     """How often the camera was lost."""
     events = o.metrics.tracking.events
-    return events if isinstance(events, Missing) else sum(each.event == "lost" for each in events)
+    return None if events is None else sum(each.event == "lost" for each in events)
 
 
-def first_map(o: JobResult) -> int | Missing:
+def first_map(o: JobResult) -> int | None:
     """Number of frames before the first map."""
-    events = o.metrics.tracking.events
-    if isinstance(events, Missing):
-        return events
-    return next((each.frame for each in events if each.event == "map begun"), Missing("no map began"))
+    events = o.metrics.tracking.events or ()
+    return next((each.frame for each in events if each.event == "map begun"), None)
 
 
-def longest_wait(o: JobResult) -> int | Missing:
+def longest_wait(o: JobResult) -> int | None:
     """Most frames from a loss until the camera was found again, or a new map began, or the recording ended."""
     events, frames = o.metrics.tracking.events, o.metrics.sequence.frames
-    if isinstance(events, Missing):
-        return events
-    if isinstance(frames, Missing):
-        return frames
+    if events is None or frames is None:
+        return None
     lost = [each.frame for each in events if each.event == "lost"]
     found = [each.frame for each in events if each.event in ("map begun", "relocalised")]
     waits = [min((frame for frame in found if frame > start), default=frames) - start for start in lost]
-    return max(waits, default=Missing("the camera was never lost"))
+    return max(waits, default=None)
 
 
 ATE = MetricDefinition("ate_7dof_known_m", "ATE 7-dof (m)", _ate, 3)

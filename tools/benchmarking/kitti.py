@@ -12,7 +12,7 @@ from benchmarking import metrics as m
 from benchmarking.plan import Job
 from benchmarking.work import JobResult, is_done, job_result
 
-from slam.results.error_columns import DASH
+from erfsfm.common.table import DASH
 from slam.sequences.catalogue import open_sequence, sequence_names
 
 ORDER = ("09", "10", *(f"{number:02d}" for number in range(9)))  # the two that papers quote come first

@@ -10,10 +10,8 @@ from typing import Any
 
 from benchmarking.plan import slug
 from benchmarking.work import JobResult, ratio
-from shared.command import markdown
 
-from slam.results.error_columns import DASH
-from slam.runtime.storage.record import Missing, known
+from erfsfm.common.table import DASH, Table
 
 Label = Callable[[JobResult], str]
 Cell = Callable[[Sequence[JobResult]], str]
@@ -27,24 +25,22 @@ class MetricDefinition:
 
     key: str
     title: str
-    value: Callable[[JobResult], float | Missing]
+    value: Callable[[JobResult], float | None]
     decimals: int
 
 
 def _error(trajectory: str, alignment: str) -> MetricDefinition:
-    def value(o: JobResult) -> float | Missing:
-        align = getattr(o.metrics.trajectories, trajectory).align
-        error: float | Missing = getattr(align, f"dof{alignment}").ate_rmse_m
+    def value(o: JobResult) -> float | None:
+        error: float | None = o.metrics.at(f"trajectories.{trajectory}.align.{alignment}dof.ate_rmse_m")[0]
         return error
 
     title = f"ATE {alignment}-dof, {trajectory}"
     return MetricDefinition(f"ate_{alignment}dof_{trajectory}_m", title, value, 2)
 
 
-def stage_seconds(o: JobResult, stage: str) -> float | Missing:
+def stage_seconds(o: JobResult, stage: str) -> float | None:
     """Seconds of a stage of a run."""
-    found = o.metrics.timing.stages
-    return found if isinstance(found, Missing) else found.get(stage, Missing())
+    return (o.metrics.timing.stages or {}).get(stage)
 
 
 FRAMES = MetricDefinition("frames", "frames", lambda o: o.metrics.sequence.frames, 0)
@@ -113,9 +109,9 @@ def rows(results: Sequence[JobResult], definitions: Sequence[MetricDefinition] =
             "commit": o.commit,
             "status": "failed" if o.reason else "ok",
             "reason": o.reason,
-            "leak": known(o.metrics.provenance.leak),
-            **{q.key: known(q.value(o)) for q in (*DEFINITIONS, *definitions)},
-            **{f"seconds_{slug(stage)}": known(stage_seconds(o, stage)) for stage in stages(results)},
+            "leak": o.metrics.provenance.leak,
+            **{q.key: q.value(o) for q in (*DEFINITIONS, *definitions)},
+            **{f"seconds_{slug(stage)}": stage_seconds(o, stage) for stage in stages(results)},
         }
         for o in results
     ]
@@ -123,14 +119,14 @@ def rows(results: Sequence[JobResult], definitions: Sequence[MetricDefinition] =
 
 def stages(results: Sequence[JobResult]) -> list[str]:
     """Every stage that some run went through, in order of appearance."""
-    return list(dict.fromkeys(stage for o in results for stage in o.metrics.timing.stages))
+    return list(dict.fromkeys(stage for o in results for stage in o.metrics.timing.stages or ()))
 
 
 def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Sequence[JobResult]) -> str:
     """Markdown: one row for each group of results that share their labels."""
     groups = grouped(results, *rows.values()).items()
     cells = [[*label, *(cell(group) for cell in columns.values())] for label, group in groups]
-    return markdown([*rows, *columns], cells, numbers=len(columns))
+    return Table([*rows, *columns], cells, names=len(rows)).markdown()
 
 
 def grouped(results: Sequence[JobResult], *labels: Label) -> dict[tuple[str, ...], list[JobResult]]:
@@ -175,7 +171,7 @@ def spread(found: Sequence[float], decimals: int, extreme: Callable[[Sequence[fl
 def values(results: Sequence[JobResult], definition: MetricDefinition) -> list[float]:
     """The values of a metric, without the results that lack it."""
     found = (definition.value(o) for o in results)
-    return [value for value in found if not isinstance(value, Missing)]
+    return [value for value in found if value is not None]
 
 
 def mean(found: Sequence[float], decimals: int) -> str:

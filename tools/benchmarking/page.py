@@ -21,10 +21,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 from shared.pictures import draw_trajectories, trajectories_of
 
-from slam.results.error_columns import DASH
+from erfsfm.common.table import DASH
 from slam.results.folder import RunFolder
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import Missing
 
 PICTURE = "images/trajectories.png"  # beside the page
 SIDE_IN = 1.9
@@ -165,9 +164,8 @@ def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition])
         if o.metrics.provenance.leak is True:
             lines[f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."] = None
         for definition in definitions:
-            value = definition.value(o)
-            if isinstance(value, Missing):
-                lines[f"{DASH} {definition.title}, {o.job.drive.name}: {value.reason}."] = None
+            if definition.value(o) is None:
+                lines[f"{DASH} {definition.title}, {o.job.drive.name}: not known."] = None
     lines |= {f"Failed: {o.job.title}: {o.reason}": None for o in results if o.reason}
     return "\n" + "".join(f"\n- {line}" for line in lines)
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from shared.command import markdown
-
+from erfsfm.common.table import Table
 from slam.runtime.run_files import METRICS
 
 _LOOK_S = 0.2
@@ -78,11 +77,11 @@ def tables(checkouts: Sequence[str], drives: Sequence[Drive], costs: Sequence[Se
     ]
     return f"""Medians of {before}, of {after}: and their ratio.
 
-{markdown(["drive", *columns], rows)}
+{Table(["drive", *columns], rows).markdown()}
 
 Time that the main thread spends in or waits for each stage, ms a frame:
 
-{markdown(["drive", "commit", *stages], by_stage)}"""
+{Table(["drive", "commit", *stages], by_stage, names=2).markdown()}"""
 
 
 def _cost(checkout: Path, drive: Drive, output: Path) -> Cost:

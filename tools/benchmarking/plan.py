@@ -39,15 +39,11 @@ class Configuration:
     overrides: tuple[str, ...] = ()
 
 
-_UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
 _NEVER = 1e9  # a limit that no measurement reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 WHOLE = (Configuration("no map", (*QUIET, "mapping.enabled=false")),)
 EVERYTHING = Configuration("everything on", QUIET)
-_NO_JITTER = ("visual_odometry.jitter_rotation_ratio=0", "visual_odometry.jitter_direction_ratio=0")
-_NO_TURNS = ("visual_odometry.turn_rotation_ratio=0",)
-_NO_NEIGHBOURS = ("visual_odometry.neighbour_rotation_ratio=0", "visual_odometry.neighbour_direction_ratio=0")
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("visual_odometry.enabled=false",),
     "no predicted flow": ("visual_odometry.predicted_flow=false",),
@@ -55,26 +51,15 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no dynamic mask": ("visual_odometry.dynamic_mask_sharpness=0",),
     "no second search with a wide window": ("visual_odometry.few_corners=0",),
     "no lengths from the road homography": ("road.enabled=false",),
-    "no ratios of neighbouring steps": (f"lengths.ratio_sigma={_UNINFORMATIVE}",),
-    "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
-    "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
-    "no short strip of road": ("road.near_heights=1e-3",),
-    "no sigma by jitter": _NO_JITTER,
-    "no sigma by turns": _NO_TURNS,
-    "no sigma by neighbouring steps": _NO_NEIGHBOURS,
-    "no inflation of step sigmas": (*_NO_JITTER, *_NO_TURNS, *_NO_NEIGHBOURS),
     "no gap interpolation": ("gaps.enabled=false",),
     "no loops": ("loops.enabled=false",),
     "no consistency among loops": ("loops.min_support=0",),
-    "no robust kernel": ("pose_graph.kernel=none",),
     "no agreement of a loop in both directions": ("loops.agreement_deg=180", f"loops.agreement_ratio={_NEVER}"),
-    "no loop dropped": (f"pose_graph.max_loop_residual={_NEVER}",),
     "no fusion": ("mapping.enabled=false",),
 }
 ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _PARTS.items()))
 _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "depth not refined": ("depth.refine=none",),
-    "depth refined by rules": ("depth.refine=multiview",),
     "no border": ("mapping.border=0",),
     "no sky": ("mapping.sky_brightness=256", "mapping.sky_blueness=256"),
     "range to 20 m, however sure": ("mapping.certain_range_factor=1",),

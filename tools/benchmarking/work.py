@@ -18,15 +18,14 @@ import numpy as np
 from benchmarking import plan
 from benchmarking.plan import BenchmarkSequence, Job
 
-from slam.commands.batch import cluster
-from slam.commands.batch.cluster import Spread
-from slam.commands.batch.execution import why_ended
+from erfsfm.common.processes import slam_process
+from slam.commands import cluster
+from slam.commands.cluster import Spread
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
 from slam.runtime.run_files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import MISSING, Missing
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
@@ -42,22 +41,22 @@ class DerivedMetrics:
     ``fusion_ms`` the time of fusion for a fused keyframe, without the refinement of its depth.
     """
 
-    network_percent: float | Missing
-    optimised_percent: float | Missing
-    of_network: float | Missing
-    fusion_ms: float | Missing
-    true_loops: int | Missing
-    false_loops: int | Missing
+    network_percent: float | None = None
+    optimised_percent: float | None = None
+    of_network: float | None = None
+    fusion_ms: float | None = None
+    true_loops: int | None = None
+    false_loops: int | None = None
 
 
 @dataclass(frozen=True)
 class ProcessMetrics:
     """Seconds of the whole command, load of the machine before, and time of a frame."""
 
-    seconds: float
-    load: float
-    ms_per_frame: float
-    cpu_ms_per_frame: float
+    seconds: float | None = None
+    load: float | None = None
+    ms_per_frame: float | None = None
+    cpu_ms_per_frame: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,17 +64,17 @@ class JobResult:
     """The metrics of a job, those derived from them and those of its process, or the reason of its failure."""
 
     job: Job
-    metrics: Metrics | Missing
+    metrics: Metrics
     commit: str
     reason: str = ""
-    derived: DerivedMetrics | Missing = MISSING
-    process: ProcessMetrics | Missing = MISSING
+    derived: DerivedMetrics = DerivedMetrics()
+    process: ProcessMetrics = ProcessMetrics()
 
 
 def simulate(drive: BenchmarkSequence) -> None:
     """Simulate a world where it is missing; `measured` checks that it was made."""
     if not drive.root.exists():
-        subprocess.run(_slam("simulate", str(drive.root), *drive.simulate), stdout=subprocess.DEVNULL, check=False)
+        slam_process(["simulate", str(drive.root), *drive.simulate])
 
 
 def perform(job: Job) -> None:
@@ -86,8 +85,8 @@ def perform(job: Job) -> None:
     job.place.mkdir(parents=True)
     record = {"identity": _identity(job), "load": os.getloadavg()[0]}
     start = time.perf_counter()
-    finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
-    record |= {"seconds": time.perf_counter() - start, "reason": why_ended(finished.returncode, finished.stderr)}
+    reason = slam_process(job.arguments)
+    record |= {"seconds": time.perf_counter() - start, "reason": reason}
     for name in BULKY:
         (job.place / "run" / name).unlink(missing_ok=True)
     write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
@@ -114,18 +113,10 @@ def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
     metrics = Metrics.read(folder / METRICS) if (folder / METRICS).is_file() else Metrics()
     reason = metrics.failure or reason
     frames, seconds, cpu = metrics.sequence.frames, metrics.timing.seconds_total, metrics.timing.cpu_seconds
-    if isinstance(frames, Missing) or isinstance(seconds, Missing) or isinstance(cpu, Missing):
-        reason = reason or f"its {METRICS} has no timing"
-        return JobResult(job, Missing(reason), commit, reason)
-    if reason:
-        return JobResult(job, Missing(reason), commit, reason)
+    if reason or frames is None or seconds is None or cpu is None:
+        return JobResult(job, Metrics(), commit, reason or f"its {METRICS} has no timing")
     process = ProcessMetrics(record["seconds"], record["load"], 1e3 * seconds / frames, 1e3 * cpu / frames)
     return JobResult(job, metrics, commit, "", derive_metrics(folder, metrics), process)
-
-
-def _slam(*arguments: str) -> list[str]:
-    """``erfsfm-slam`` of this interpreter, whatever the working directory holds."""
-    return [sys.executable, "-P", "-m", "slam", *arguments]
 
 
 def revision(checkout: Path = ROOT) -> str:
@@ -175,7 +166,7 @@ def derive_metrics(folder: Path, metrics: Metrics) -> DerivedMetrics:
     """What follows from the metrics of a run and its files."""
     length, trajectories, stages = metrics.sequence.length_m, metrics.trajectories, metrics.timing.stages
     network, optimised = trajectories.network.align.dof7.ate_rmse_m, trajectories.optimised.align.dof7.ate_rmse_m
-    fusion = stages if isinstance(stages, Missing) else stages.get("map", Missing("no map"))
+    fusion = (stages or {}).get("map")
     return DerivedMetrics(
         ratio(network, length, 100.0),
         ratio(optimised, length, 100.0),
@@ -185,25 +176,17 @@ def derive_metrics(folder: Path, metrics: Metrics) -> DerivedMetrics:
     )
 
 
-def ratio(part: float | Missing, whole: float | Missing, unit: float) -> float | Missing:
+def ratio(part: float | None, whole: float | None, unit: float) -> float | None:
     """A part of a whole, in a unit."""
-    if isinstance(part, Missing):
-        return part
-    if isinstance(whole, Missing):
-        return whole
-    return unit * part / whole if whole else Missing("nothing to compare with")
+    return None if part is None or not whole else unit * part / whole
 
 
-def _loops(folder: Path, metrics: Metrics) -> tuple[int | Missing, int | Missing]:
-    """Number of true and of false loops."""
-    reference, number = RunFolder.open(folder).trajectory("reference"), metrics.loops.accepted
-    if reference is None:
-        number = Missing("the sequence has no true poses")
-    elif not metrics.is_metric:
-        number = Missing(f"loops in {metrics.unit} cannot be compared with metres")
-    if reference is None or isinstance(number, Missing):
-        return number, number
-    accepted = list(LoopsFile.read(folder / LOOPS).accepted)
+def _loops(folder: Path, metrics: Metrics) -> tuple[int | None, int | None]:
+    """Number of true and of false loops; None without truth in metres."""
+    reference = RunFolder.open(folder).trajectory("reference")
+    if reference is None or not metrics.is_metric or metrics.loops.accepted is None:
+        return None, None
+    accepted = LoopsFile.read(folder / LOOPS).accepted or []
     false = sum(
         is_false(np.array(loop.T_from_to), *reference.T_world_camera[[loop.from_, loop.to]]) for loop in accepted
     )

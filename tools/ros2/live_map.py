@@ -5,9 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.commands.exports.ground import ground_along
-from slam.commands.exports.occupancy import OBSTACLE_FROM_M, OBSTACLE_TO_M
-from slam.commands.exports.sampling import Grid
+from slam.commands.occupancy import OBSTACLE_FROM_M, OBSTACLE_TO_M, Grid, ground_along
 from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
 
 USUAL_CAMERA_HEIGHT_M = 1.65

@@ -1,9 +1,9 @@
-"""What the tools share: parsers, errors as one line, Markdown tables."""
+"""What the tools share: parsers, and errors as one line."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from erfsfm.common.errors import OneLineError
@@ -21,10 +21,3 @@ def one_line_errors() -> Iterator[None]:
         yield
     except OneLineError as error:
         raise SystemExit(str(error)) from error
-
-
-def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
-    """A table in Markdown; its last ``numbers`` columns are aligned to the right."""
-    rule = "|" + "---|" * (len(head) - numbers) + "---:|" * numbers
-    first, *others = (f"| {' | '.join(cells)} |" for cells in (head, *rows))
-    return "\n".join([first, rule, *others])

@@ -15,7 +15,7 @@ from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.results.report.figures import LOOKS
-from slam.results.report.map_mesh import MapMesh
+from slam.results.report.map_view import MapMesh
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import REFERENCE, TRAJECTORIES
 

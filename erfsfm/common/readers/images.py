@@ -136,15 +136,13 @@ def read_values(path: Path) -> NDArray[Any]:
     Raises:
         DataError: missing, empty, truncated or no image; one line.
     """
-    data = _file_bytes(path)
-    _require_complete(data, f"image {path}")
-    return _decode(f"image {path}", data, cv2.IMREAD_UNCHANGED)
+    return decode_values(_file_bytes(path), f"image {path}")
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Height and width of an image file; raises as `read_image`."""
-    height, width = read_image(path).shape[:2]
-    return height, width
+def decode_values(data: bytes, where: str) -> NDArray[Any]:
+    """As `read_values`, of the bytes of a file; ``where`` they come from is for messages."""
+    _require_complete(data, where)
+    return _decode(where, data, cv2.IMREAD_UNCHANGED)
 
 
 def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
@@ -14,7 +13,15 @@ import cv2
 import numpy as np
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import IMAGE_SUFFIXES, first_size, is_image, natural_key, read_image
+from erfsfm.common.readers.images import (
+    IMAGE_SUFFIXES,
+    Stretch,
+    first_size,
+    is_image,
+    natural_key,
+    read_image,
+    stretch_of,
+)
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.sequences.camera_file import DEFAULT_FPS
@@ -52,6 +59,7 @@ class FolderSource:
         """
         self._folder, self.fps = folder, DEFAULT_FPS
         self._past: set[str] = set()
+        self._stretch: Stretch | None = None
         self.height, self.width = self._first_size(wait_s)
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
@@ -97,13 +105,19 @@ class FolderSource:
     @sequence_errors()
     def _first_size(self, wait_s: float) -> tuple[int, int]:
         deadline = time.monotonic() + wait_s
-        while time.monotonic() < deadline:
-            with suppress(DataError):
+        while True:
+            is_late = time.monotonic() >= deadline
+            try:
                 if waiting := self._waiting():
-                    return first_size(waiting)
+                    size = first_size(waiting)
+                    self._stretch = stretch_of(waiting)
+                    return size
+            except DataError:
+                if is_late:
+                    raise
+            if is_late:
+                break
             time.sleep(_POLL_S)
-        if waiting := self._waiting():
-            return first_size(waiting)
         suffixes = ", ".join(IMAGE_SUFFIXES)
         raise SequenceError(f"no image came to {self._folder} within {wait_s:g} s: looked for {suffixes}")
 
@@ -113,7 +127,7 @@ class FolderSource:
         is_written = False
         while True:
             try:
-                return read_image(path)
+                return read_image(path, self._stretch)
             except DataError:
                 if time.monotonic() > deadline or is_written:
                     raise

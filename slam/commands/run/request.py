@@ -1,15 +1,12 @@
-"""The inputs of a run: the options of the verb ``run`` and the arguments of `slam.run_slam`, written once."""
+"""The inputs of a run: the options of the verb ``run`` and the arguments of `slam.run_slam`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any, Literal
 
 from erfsfm.common.progress import Progress
-from slam.commands.options import LARGEST_SEED, Config, Device, Output, Overrides, Weights
 from slam.runtime.errors import RunError
 from slam.runtime.storage.files import from_anywhere
 
@@ -18,11 +15,12 @@ if TYPE_CHECKING:
 
 _RECORDING = ("dataset", "camera", "gps", "sequence", "frames", "truth")
 _TEXTS = ("weights", "config")  # names, or paths
+LARGEST_SEED = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """All inputs of a run. Those with a help are options of the command line.
+    """All inputs of a run, as ``erfsfm-slam run --help`` explains them.
 
     Without ``dataset`` and ``sequence`` the embedded simulated street is run. From Python, a path may be text.
 
@@ -31,29 +29,19 @@ class RunRequest:
         command: recorded in the metrics.
     """
 
-    dataset: Annotated[
-        Path | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
-    ] = None
-    sequence: Annotated[
-        str | None,
-        typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
-    ] = None
-    camera: Annotated[
-        Path | None,
-        typer.Option("--camera", "--calibration", help="camera.yaml, or fov=70: the horizontal field of view, degrees"),
-    ] = None
-    weights: Weights = "default"
-    config: Config = None
-    overrides: Overrides = None
-    frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None
-    truth: Annotated[Path | None, typer.Option(help="true camera poses: KITTI (a row a frame) or TUM (by stamps)")] = (
-        None
-    )
-    output: Output = None
-    rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None
-    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA")] = None
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="of every random draw")] = 0
-    device: Device = "auto"
+    dataset: Path | None = None
+    sequence: str | None = None
+    camera: Path | None = None
+    weights: str = "default"
+    config: str | None = None
+    overrides: list[str] | None = None
+    frames: str | None = None
+    truth: Path | None = None
+    output: Path | None = None
+    rerun: Path | None = None
+    gps: Path | None = None
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
     progress: Progress | None = None
     command: str = "slam.run_slam"
 
@@ -71,7 +59,8 @@ class RunRequest:
 
         unknown = arguments.keys() - {field.name for field in fields(cls)}
         if unknown:
-            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
+            names = ", ".join(field.name for field in fields(cls) if field.name != "command")
+            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}; it has {names}")
         arguments |= {key: str(arguments[key]) for key in _TEXTS if isinstance(arguments.get(key), Path)}
         try:
             request = TypeAdapter(cls).validate_python(arguments)
@@ -92,4 +81,4 @@ class RunRequest:
             for name, value in given.items()
             if value is not None
         }
-        return Recording(**texts)
+        return Recording.of(**texts)

@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from erfsfm import __version__
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.progress import progress_bar, progress_lines, silent
 from erfsfm.common.signals import raising_on_termination
-from erfsfm.inference import DepthPosePredictor, commit
-from slam.commands.run.job import Job, complete
+from erfsfm.common.threads import limit_library_threads
+from erfsfm.inference import commit
+from slam.commands.run.recorder import FolderRecorder
 from slam.commands.run.request import RunRequest
-from slam.config.sections import SlamConfig, load_config
+from slam.config.sections import load_config
+from slam.frames import Frame
 from slam.frames import Sequence as FrameSequence
-from slam.pipeline.batch import SlamPipeline
-from slam.prediction.assembly import make_predictor, open_depth
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.run import SlamPipeline
+from slam.prediction.assembly import Prediction, open_prediction
 from slam.prediction.depth_folder import FrameNumbers
-from slam.prediction.depth_source import DepthSource
 from slam.results.folder import RunFolder
 from slam.results.metrics import Provenance
 from slam.results.output_folder import check_output
-from slam.results.run_log import run_log
+from slam.results.report.rerun import write_rerun
+from slam.results.run_log import RunLog, run_log
 from slam.runtime.imports import import_extra
+from slam.runtime.run_files import LOG
 from slam.runtime.storage.files import from_anywhere
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import recording_of, undistortion_of
@@ -62,57 +67,65 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
 def perform(request: RunRequest) -> RunFolder:
     """Run the whole system on one sequence.
 
-    All checks come before a folder is made; an earlier run in ``output`` is removed then.
+    All checks come before a folder is made; an earlier run in ``output`` is removed then. The first signal to end
+    during the pass over the frames ends the pass: what was seen is a whole run.
 
     Raises:
         SlamError, ErfsfmError: one line. However a run ends, its folder keeps its results and the reason.
     """
     with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
-        job = _prepare(request)
-        folder = RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name, lock)
-        return complete(job, folder, log, ignore_signals)
+        if request.output is not None:
+            check_output(request.output)
+        if request.rerun is not None:
+            import_extra("rerun")
+        settings = load_config(request.config, request.overrides or ())
+        recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
+        lens, camera, (base, start) = undistortion_of(recording), recording.intrinsics, recording_of(recording)
+        numbers = FrameNumbers(len(recording), start, len(base))  # by which files of depth are found
+        undistort = None if lens is None else lens.apply_to_depth
+        prediction = open_prediction(request.weights, request.device, settings.depth, camera, numbers, undistort)
+        track = None if request.gps is None else read_gps(request.gps)
+        progress = request.progress or silent
+        pipeline = SlamPipeline(recording, prediction.predictor, settings, progress, request.seed, track)
+        pipeline.require_possible()
+        folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
+        recorder = FolderRecorder(folder, pipeline, settings, provenance_of(request, prediction, recording), progress)
+        estimate = record(recorder, log, ignore_signals)
+        if request.rerun is not None:
+            write_rerun(request.rerun, estimate, pipeline.sequence.intrinsics)
+    return folder
 
 
-def _prepare(request: RunRequest) -> Job:
-    """Open and check all inputs of a run; writes nothing."""
-    if request.output is not None:
-        check_output(request.output)
-    if request.rerun is not None:
-        import_extra("rerun")
-    settings = load_config(request.config, request.overrides or ())
-    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
-    networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
-    lens = undistortion_of(recording)
-    undistort = None if lens is None else lens.apply_to_depth
-    source = open_depth(settings.depth, recording.intrinsics, _frame_numbers(recording), undistort)
-    predictor = make_predictor(networks, source, settings.depth, recording.intrinsics)
-    track = None if request.gps is None else read_gps(request.gps)
-    pipeline = SlamPipeline(recording, predictor, settings, request.progress or silent, request.seed, track)
-    pipeline.require_possible()
-    provenance = provenance_of(request, networks, recording, source)
-    settings = _settings_from_anywhere(settings)
-    return Job(settings, recording, pipeline, provenance, request.rerun, request.progress or silent)
+def record(
+    recorder: FolderRecorder,
+    log: RunLog,
+    ignore_signals: Callable[[], None],
+    frames: Iterator[Frame] | None = None,
+    interrupt: Callable[[], None] | None = None,
+) -> Estimate:
+    """Run to the end; however that is, the folder keeps the results and the reason.
+
+    The first signal to end during the pass over the frames calls ``interrupt``, by default that of the pipeline.
+
+    Raises:
+        SlamError, ErfsfmError: one line.
+    """
+    try:
+        recorder.begin()
+        log.begin(recorder.folder.path / LOG)
+        with limit_library_threads():
+            estimate = recorder.pipeline.run(recorder, frames, interrupt)
+        recorder.finish(estimate)
+        return estimate
+    except BaseException as error:
+        ignore_signals()
+        log.failed(recorder.fail(error))
+        raise
 
 
-def _settings_from_anywhere(settings: SlamConfig) -> SlamConfig:
-    """The same with the source of depth by its whole path."""
-    kind, colon, path = settings.depth.source.partition(":")
-    if not colon:
-        return settings
-    depth = settings.depth.model_copy(update={"source": f"{kind}:{from_anywhere(path)}"})
-    return settings.model_copy(update={"depth": depth})
-
-
-def _frame_numbers(recording: FrameSequence) -> FrameNumbers:
-    """The frames of this run in their recording, by which files of depth are found."""
-    base, start = recording_of(recording)
-    return FrameNumbers(len(recording), start, len(base))
-
-
-def provenance_of(
-    request: RunRequest, networks: DepthPosePredictor, recording: FrameSequence, source: DepthSource | None
-) -> Provenance:
+def provenance_of(request: RunRequest, prediction: Prediction, recording: FrameSequence) -> Provenance:
     """The input of a run: networks, depth, and the options that name the recording."""
+    networks, source = prediction.networks, prediction.source
     is_folder = Path(request.weights) == Path(networks.origin)  # else a shipped name, whatever lies here
     return Provenance(
         version=__version__,

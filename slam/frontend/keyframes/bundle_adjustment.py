@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.depth_prior import HUBER
 from slam.frontend.keyframes.reduced_system import Part, solve_sum
-from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
-from slam.geometry.projection import pixel_jacobian
+from slam.geometry.resection import LEAST_DEPTH as _LEAST_DEPTH
+from slam.geometry.resection import pixel_jacobian
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, compose, make
 
 _FIRST_DAMPING = 1e-4
@@ -92,7 +93,8 @@ class BundleAdjustment:
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
         self._rows = [np.flatnonzero(sightings.camera == camera) for camera in range(len(free))]
-        self._learned_rows = [rows[self._learned[rows]] for rows in self._rows]
+        learned = [rows[self._learned[rows]] for rows in self._rows]
+        self._learned_rows = [rows for rows in learned if len(rows)]
         self._blocks = self._eliminated_together()
 
     def solve(
@@ -139,16 +141,17 @@ class BundleAdjustment:
         It is where an adjustment of the images' units would end, so that derivatives need not know it.
         """
         whitened = np.zeros(len(logarithms))
-        for rows in self._learned_rows:
-            if len(rows):
-                own, sigma = logarithms[rows], self._depth_sigma[rows]
-                unit = float(np.median(own))
-                for _ in range(_ROUNDS):
-                    weight = (
-                        np.minimum(1.0, self._noise.huber * sigma / np.maximum(np.abs(own - unit), 1e-9)) / sigma**2
-                    )
-                    unit = float((weight * own).sum() / weight.sum())
-                whitened[rows] = (own - unit) / sigma
+        if not self._learned_rows:
+            return whitened
+        rows = np.concatenate(self._learned_rows)
+        image = np.repeat(np.arange(len(self._learned_rows)), [len(each) for each in self._learned_rows])
+        own, sigma = logarithms[rows], self._depth_sigma[rows]
+        near, full = self._noise.huber * sigma, sigma**-2
+        unit = np.array([median(logarithms[each]) for each in self._learned_rows])
+        for _ in range(_ROUNDS):
+            weight = full * np.minimum(1.0, near / np.maximum(np.abs(own - unit[image]), 1e-9))
+            unit = np.bincount(image, weight * own) / np.bincount(image, weight)
+        whitened[rows] = (own - unit[image]) / sigma
         return whitened
 
     def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:

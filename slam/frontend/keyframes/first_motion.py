@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA
-from slam.frontend.visual.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
+from slam.frontend.visual.two_view import CORNER_CORRELATION
+from slam.geometry.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
 from slam.geometry.se3 import FloatArray, make
 
 _INLIER_PX = 1.0
 _LIMITS = 30, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
-_BETTER = 0.8  # of the cost of the first start, for another one to be taken
+_GAIN = 0.5 * (3.0 * CORNER_CORRELATION) ** 2  # of the cost: three sigmas, of corners whose errors are correlated
 
 
 def first_motion(
@@ -62,6 +63,6 @@ def first_motion(
     )
     problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]), Noise())
     solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_LIMITS) for T, z in starts]
-    costs = np.array([each.cost for each in solved])
-    best = solved[int(np.argmin(costs))] if costs.min() < _BETTER * costs[0] else solved[0]
+    costs = np.array([adjusted.cost for adjusted in solved])
+    best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
     return best.T_camera_world[1], best.points[:, 2]

@@ -78,7 +78,7 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
         normal *= np.sign(normal @ down)
         height = float(normal @ middle)
     below = (points @ normal > (1.0 + _THICKNESS) * height).sum()
-    each = height - centres @ normal
-    usual = float(np.median(each))
-    is_level = normal @ down > _LEAST_COSINE * np.linalg.norm(down) and np.std(each) < _MOST_SPREAD * usual
+    heights_above = height - centres @ normal
+    usual = float(np.median(heights_above))
+    is_level = normal @ down > _LEAST_COSINE * np.linalg.norm(down) and np.std(heights_above) < _MOST_SPREAD * usual
     return usual if is_level and below < _MOST_BELOW * len(floor) else None

@@ -1,18 +1,23 @@
 """How the camera turned since the last image, by aligning small images: bare walls and windows show it without corners.
 
 Small images as PTAM aligns them (Klein and Murray 2008), over the three angles of a turn, with the gradients of the
-first image (Baker and Matthews 2004).
+first image (Baker and Matthews 2004). Rows of a rolling shutter are read one after another while the camera turns:
+corners are moved to where one moment would show them, by a turn at a steady rate that moves the image as a whole.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from slam.frames import Grey, Intrinsics
+from slam.frontend.tracking import Pixels
+from slam.geometry.epipolar import rotation_between
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix
 
 _REDUCED = 8  # an image over the small one
@@ -22,8 +27,10 @@ _LEAST_CONTRAST = 3.0  # grey levels, of noise
 _OUTLIER = 0.7  # residual of local contrast at which a pixel counts half
 _ITERATIONS, _CONVERGED = 10, 1e-4
 _LEAST_PIXELS = 200
+_LEAST_CORNERS, _SHUTTER_ITERATIONS = 20, 3  # by which a rolling shutter's turn is measured
 
 SmallImage = NDArray[np.float32]
+_Places = TypeVar("_Places", Pixels, FloatArray)
 
 
 @dataclass(frozen=True)
@@ -59,15 +66,15 @@ def image_turn(
     pairs = [(before, now, scale)]
     if min(now.shape) >= 2 * _COARSE * _SMOOTH_PX:
         size = now.shape[1] // _COARSE, now.shape[0] // _COARSE
-        coarse = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (before, now))
+        coarse = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (before, now))
         pairs.insert(0, (*coarse, scale / _COARSE))
     yaw, pitch = np.arctan(shift / [intrinsics.fx, intrinsics.fy])
     R_shift = rotation_matrix(np.array([-pitch, yaw, 0.0]))
-    found = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
-    for first, second, each in pairs:
-        problem = _Alignment(first, second, intrinsics, each)
-        found = [max((problem.solve(turn.R_now_before) for turn in found), key=lambda turn: turn.correlation)]
-    return found[0]
+    turns = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
+    for first, second, size_ratio in pairs:
+        problem = _Alignment(first, second, intrinsics, size_ratio)
+        turns = [max((problem.solve(turn.R_now_before) for turn in turns), key=lambda turn: turn.correlation)]
+    return turns[0]
 
 
 class _Alignment:
@@ -132,3 +139,39 @@ def turned(pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: In
     ahead = rays[:, 2] > 0.1
     rays[~ahead, 2] = 1.0
     return np.where(ahead[:, None], intrinsics.project(rays), pixels).astype(np.float32)
+
+
+def in_middle_row(pixels: _Places, turn: FloatArray, intrinsics: Intrinsics) -> _Places:
+    """Pixels ``(M, 2)`` of an image as the camera sees them when the middle row is read.
+
+    Args:
+        pixels: as the image has them.
+        turn: of the camera, rotation vector a second ``(3,)``, as of ``R_current_previous``.
+        intrinsics: of the image.
+    """
+    if not intrinsics.readout_s or not len(pixels):
+        return pixels
+    seconds = intrinsics.readout_s * ((pixels[:, 1] + 0.5) / intrinsics.height - 0.5)
+    rays = Rotation.from_rotvec(-seconds[:, None] * turn).apply(intrinsics.rays(pixels.astype(np.float64)))
+    return intrinsics.project(rays).astype(pixels.dtype)
+
+
+def measured_turn(
+    before: Pixels | FloatArray, pixels: Pixels, seconds: float, turn: FloatArray, intrinsics: Intrinsics
+) -> FloatArray:
+    """The turn a second ``(3,)`` between two images; zero with few corners.
+
+    Args:
+        before: corners in the image before ``(M, 2)``, when its middle row was read.
+        pixels: the same corners in this image ``(M, 2)``, as it has them.
+        seconds: between the images.
+        turn: the one before, to start from.
+        intrinsics: of both images.
+    """
+    if len(pixels) < _LEAST_CORNERS or seconds <= 0:
+        return np.zeros(3)
+    rays_before = intrinsics.rays(before.astype(np.float64))
+    for _ in range(_SHUTTER_ITERATIONS):
+        rays = intrinsics.rays(in_middle_row(pixels, turn, intrinsics).astype(np.float64))
+        turn = Rotation.from_matrix(rotation_between(rays_before, rays)).as_rotvec() / seconds
+    return turn

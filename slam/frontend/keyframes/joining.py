@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
+from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, MapSegment, TrackedFrame, TrackedKeyframe, TrackIds
 from slam.geometry.se3 import FloatArray, apply, invert
 
 logger = logging.getLogger(__name__)
@@ -22,20 +21,15 @@ _OUTLIER_LIMITS = (4.0, 2.0, 1.0)
 _LIMITS = 20, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
 
 
-@dataclass(frozen=True)
-class SharedCorners:
-    """Corners seen by two keyframes, given by their rows: ``corners`` ``(M, 2)`` of the earlier and the later one."""
-
-    earlier: int
-    later: int
-    corners: NDArray[np.intp]
+# rows of an earlier and of a later keyframe, and of the corners of both that are one point (M, 2)
+Shared = tuple[int, int, NDArray[np.intp]]
 
 
 def join(
     segments: Sequence[MapSegment],
     T_world_camera: FloatArray,
     scales: FloatArray,
-    shared: Sequence[SharedCorners],
+    shared: Sequence[Shared],
     intrinsics: Intrinsics,
 ) -> tuple[MapSegment, list[float]]:
     """One map of several, or of one with loops; the segments stay as they are.
@@ -44,7 +38,7 @@ def join(
         segments: in time order, started.
         T_world_camera: of all their keyframes in one world ``(K, 4, 4)``.
         scales: units of that world per unit of each keyframe's own map ``(K,)``.
-        shared: between keyframes, by rows of these.
+        shared: corners of keyframes.
         intrinsics: of all images.
 
     Returns:
@@ -55,7 +49,7 @@ def join(
     tracks = _merged_tracks(keyframes, len(united.map.points), shared)
     joined = _renumbered(united, tracks)
     _adjust_all(joined.map, intrinsics)
-    return joined, [_kept_ratio(each, keyframes, joined.map.keyframes, tracks) for each in shared]
+    return joined, [_kept_ratio(*pair, keyframes, joined.map.keyframes, tracks) for pair in shared]
 
 
 def _parts(
@@ -76,8 +70,8 @@ def moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -
     before = segment.map
     points = np.full_like(before.points, np.nan)
     for keyframe, T, scale in reversed(list(zip(before.keyframes, T_world_camera, scales, strict=True))):
-        own = apply(keyframe.T_camera_world, before.points[keyframe.track_ids])
-        points[keyframe.track_ids] = apply(T, scale * own)
+        points_camera = apply(keyframe.T_camera_world, before.points[keyframe.track_ids])
+        points[keyframe.track_ids] = apply(T, scale * points_camera)
     T_camera_world = invert(T_world_camera)
     keyframes = [replace(k, T_camera_world=T) for k, T in zip(before.keyframes, T_camera_world, strict=True)]
     indices = np.array([keyframe.index for keyframe in keyframes])
@@ -112,7 +106,7 @@ def _united(segments: Sequence[MapSegment]) -> MapSegment:
     return MapSegment(LocalMap(keyframes, points), frames, True, turns)
 
 
-def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[SharedCorners]) -> TrackIds:
+def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[Shared]) -> TrackIds:
     """For each track the first one of the same point ``(count,)``; a keyframe never sees a point twice."""
     first = np.arange(count)
     members: dict[int, list[int]] = {}
@@ -120,9 +114,9 @@ def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Seq
     for row, keyframe in enumerate(keyframes):
         for track in keyframe.track_ids.tolist():
             seen_by.setdefault(track, set()).add(row)
-    for each in sorted(shared, key=lambda one: -len(one.corners)):
-        tracks_earlier = keyframes[each.earlier].track_ids[each.corners[:, 0]]
-        tracks_later = keyframes[each.later].track_ids[each.corners[:, 1]]
+    for earlier, later, corners in sorted(shared, key=lambda pair: -len(pair[2])):
+        tracks_earlier = keyframes[earlier].track_ids[corners[:, 0]]
+        tracks_later = keyframes[later].track_ids[corners[:, 1]]
         for a, b in zip(first[tracks_earlier].tolist(), tracks_later.tolist(), strict=True):
             one, other = sorted((int(first[a]), int(first[b])))
             if one == other or seen_by[one] & seen_by[other]:
@@ -156,10 +150,15 @@ def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
 
 
 def _kept_ratio(
-    shared: SharedCorners, before: Sequence[TrackedKeyframe], after: Sequence[TrackedKeyframe], tracks: TrackIds
+    earlier: int,
+    later: int,
+    corners: NDArray[np.intp],
+    before: Sequence[TrackedKeyframe],
+    after: Sequence[TrackedKeyframe],
+    tracks: TrackIds,
 ) -> float:
     seen = [
-        np.isin(tracks[before[row].track_ids[corners]], after[row].track_ids)
-        for row, corners in zip((shared.earlier, shared.later), shared.corners.T, strict=True)
+        np.isin(tracks[before[row].track_ids[rows]], after[row].track_ids)
+        for row, rows in zip((earlier, later), corners.T, strict=True)
     ]
     return float(np.mean(seen[0] & seen[1]))

@@ -10,19 +10,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
+from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
-from slam.frontend.keyframes.descriptors import Descriptors
-from slam.frontend.keyframes.flow import flow
-from slam.frontend.sparse_flow import Pixels
+from slam.frontend.tracking import OF_KEYFRAMES, Pixels, track
 from slam.geometry.se3 import FloatArray, apply, invert
 
 TrackIds = NDArray[np.int64]
 
 _IMAGES_KEPT = 20
 _LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
-_MATCHED_LEVELS = 1
+_MATCHED = OF_KEYFRAMES._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
 _SHARED = 5
@@ -117,10 +115,10 @@ class LocalMap:
         return self._parallax(self.keyframes if last is None else self.keyframes[-last:])
 
     def _parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
-        found = Parallax(self.points)
+        parallax = Parallax(self.points)
         for keyframe in keyframes:
-            found.see(keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)])
-        return found
+            parallax.see(keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)])
+        return parallax
 
     def add_points(self, intrinsics: Intrinsics) -> None:
         """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map."""
@@ -229,9 +227,9 @@ class LocalMap:
             a, b = a[pending[b]], b[pending[b]]
             if len(a) < _LEAST_MATCHED:
                 continue
-            found, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics)
-            kept &= np.linalg.norm(found - pixels[b], axis=1) < _ALIGNED_PX
-            pixels[b[kept]] = found[kept]
+            matched, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics)
+            kept &= np.linalg.norm(matched - pixels[b], axis=1) < _ALIGNED_PX
+            pixels[b[kept]] = matched[kept]
             pending[b[kept]] = False
         return pixels
 
@@ -253,10 +251,10 @@ class LocalMap:
             rows, projected = rows[inside], projected[inside]
             if len(rows) < _LEAST_MATCHED:
                 continue
-            found, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics)
-            kept &= np.linalg.norm(found - projected, axis=1) < _PROJECTED_PX
+            matched, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics)
+            kept &= np.linalg.norm(matched - projected, axis=1) < _PROJECTED_PX
             tracks.append(keyframe.track_ids[rows[kept]])
-            places.append(found[kept])
+            places.append(matched[kept])
             attempts[keyframe.track_ids[rows]] -= 1
             attempts[tracks[-1]] = 0
             misses = misses + 1 if kept.sum() < _LEAST_FOUND * len(rows) else 0
@@ -282,6 +280,33 @@ class LocalMap:
         return [kept[k] for k in near[order]]
 
 
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost."""
+
+    index: int
+    track_ids: TrackIds
+    pixels: Pixels
+    T_camera_world: FloatArray | None
+
+
+@dataclass
+class MapSegment:
+    """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points.
+
+    ``turns`` are motions of the camera where no point carries the unit, in the unit of learned depth.
+    """
+
+    map: LocalMap = field(default_factory=LocalMap)
+    frames: list[TrackedFrame] = field(default_factory=list)
+    started: bool = False
+    turns: list[RelativePose] = field(default_factory=list)
+
+    def copy(self) -> MapSegment:
+        """A snapshot, which stays while this map grows."""
+        return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())
+
+
 def _matched(
     keyframe: TrackedKeyframe,
     rows: NDArray[np.intp],
@@ -299,4 +324,4 @@ def _matched(
     turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
     pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-    return flow(turned, grey, pixels, guesses, _MATCHED_LEVELS)
+    return track(turned, grey, pixels, _MATCHED, guesses)

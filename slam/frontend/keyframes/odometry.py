@@ -9,24 +9,29 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
-from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
-from slam.frontend.keyframes.descriptors import describe
 from slam.frontend.keyframes.first_motion import first_motion
-from slam.frontend.keyframes.flow import flow, new_corners
-from slam.frontend.keyframes.image_turn import ImageTurn, SmallImage, image_shift, image_turn, small_image, turned
-from slam.frontend.keyframes.local_map import TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment, TrackedFrame
-from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
-from slam.frontend.sparse_flow import Pixels
-from slam.frontend.visual.epipolar import parallax_px
+from slam.frontend.keyframes.image_turn import (
+    ImageTurn,
+    SmallImage,
+    image_shift,
+    image_turn,
+    in_middle_row,
+    measured_turn,
+    small_image,
+    turned,
+)
+from slam.frontend.keyframes.local_map import MapSegment, TrackedFrame, TrackedKeyframe, TrackIds
+from slam.frontend.tracking import OF_KEYFRAMES, Pixels, new_corners, track
+from slam.geometry.epipolar import parallax_px
+from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
+from slam.loops.descriptors import describe
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +40,6 @@ _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 _LEAST_CORRELATION, _SURE_CORRELATION = 0.4, 0.8  # of turned images, for a guess, and for a measurement
-_PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
@@ -44,22 +48,6 @@ _PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
 _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
-
-
-@dataclass
-class _State:
-    """Maps of a drive so far; of the last one, what continues: places of the keyframe's corners ``(M, 2)``, poses."""
-
-    segments: list[MapSegment] = field(default_factory=list)
-    places: Pixels = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    slipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    T_camera_world: FloatArray = field(default_factory=lambda: np.eye(4))
-    T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
-    lost: int = 0
-    stamp: float = 0.0
-    turn: FloatArray = field(default_factory=lambda: np.zeros(3))  # a second, where the shutter rolls
-    small: SmallImage = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    events: list[TrackingEvent] = field(default_factory=list)
 
 
 class KeyframeOdometry:
@@ -80,23 +68,30 @@ class KeyframeOdometry:
         self._intrinsics = intrinsics
         self._seed = seed
         self._on_keyframe = on_keyframe
-        self._state = _State()
+        self._segments: list[MapSegment] = []  # of the drive so far; what follows continues the last one
+        self._places: Pixels = np.zeros((0, 2), np.float32)  # of the keyframe's corners
+        self._slipped: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self._T_camera_world = self._T_last_step = np.eye(4)
+        self._lost, self._stamp = 0, 0.0
+        self._turn_rate = np.zeros(3)  # a second, where the shutter rolls
+        self._small: SmallImage = np.zeros((0, 0), np.float32)
+        self._events: list[TrackingEvent] = []
         self._spread: FloatArray | None = None  # of the points of the last keyframe, once they are looked for
 
     @property
     def segments(self) -> Sequence[MapSegment]:
         """The maps so far, which grow with the frames."""
-        return self._state.segments
+        return self._segments
 
     @property
     def events(self) -> Sequence[TrackingEvent]:
         """What became of the maps so far."""
-        return self._state.events
+        return self._events
 
     def lost_map(self) -> MapSegment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""
-        started = [segment for segment in self._state.segments if segment.started]
-        is_lost = bool(started) and (self._state.lost > 0 or not self._state.segments[-1].started)
+        started = [segment for segment in self._segments if segment.started]
+        is_lost = bool(started) and (self._lost > 0 or not self._segments[-1].started)
         return started[-1] if is_lost else None
 
     def relocalise(
@@ -116,17 +111,16 @@ class KeyframeOdometry:
             pixels: where the frame sees them ``(M, 2)``.
             place: the frame of the keyframe with most of these points.
         """
-        state = self._state
-        if state.segments[-1].started:
-            self._note(state.segments[-1].frames[-state.lost].index, "lost")
-            state.segments[-1].frames.pop()
+        if self._segments[-1].started:
+            self._note(self._segments[-1].frames[-self._lost].index, "lost")
+            self._segments[-1].frames.pop()
         else:
-            state.segments.pop()
+            self._segments.pop()
         self._note(frame.index, "relocalised", place, len(track_ids))
-        segment = state.segments[-1]
-        state.T_camera_world, state.T_last_step, state.lost = T_camera_world, np.eye(4), 0
+        segment = self._segments[-1]
+        self._T_camera_world, self._T_last_step, self._lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
-        pixels = in_middle_row(pixels, state.turn, self._intrinsics)
+        pixels = in_middle_row(pixels, self._turn_rate, self._intrinsics)
         segment.frames.append(self._tracked(frame, track_ids, pixels))
 
     def follow(self, frame: Frame) -> None:
@@ -135,36 +129,35 @@ class KeyframeOdometry:
         Where too few corners are tracked, the turn of the whole image leads to a keyframe of new corners. Depth of the
         last keyframe has been learned, if it has any.
         """
-        state = self._state
-        before, state.small = state.small, small_image(frame.grey)
-        shift = image_shift(before, state.small)
-        images = before, state.small, state.T_last_step[:3, :3], shift, self._intrinsics
+        before, self._small = self._small, small_image(frame.grey)
+        shift = image_shift(before, self._small)
+        images = before, self._small, self._T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
-        since, state.stamp = frame.stamp - state.stamp, frame.stamp
-        if not state.segments or not state.segments[-1].started:  # without learned depth there are no points
-            del state.segments[-1:]
+        since, self._stamp = frame.stamp - self._stamp, frame.stamp
+        if not self._segments or not self._segments[-1].started:  # without learned depth there are no points
+            del self._segments[-1:]
             self._begin(frame)
             return
-        segment = state.segments[-1]
+        segment = self._segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
         self._measure_turn(segment, track_ids, pixels, since)
         if self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
-        state.T_last_step = make(turn.R_now_before, np.zeros(3))
-        if turn.correlation > _SURE_CORRELATION and not state.lost:
-            state.T_camera_world = compose(state.T_last_step, state.T_camera_world)
+        self._T_last_step = make(turn.R_now_before, np.zeros(3))
+        if turn.correlation > _SURE_CORRELATION and not self._lost:
+            self._T_camera_world = compose(self._T_last_step, self._T_camera_world)
             self._add_keyframe(segment, frame, *_NOTHING)
             segment.frames.append(self._tracked(frame, *_NOTHING))
             return
-        state.lost += 1
+        self._lost += 1
         segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
-        if (state.lost + 1) * since > _MAX_LOST_S:
+        if (self._lost + 1) * since > _MAX_LOST_S:
             self._begin(frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of the frame that was followed last, which gives points where it is a keyframe."""
-        segment = self._state.segments[-1]
+        segment = self._segments[-1]
         local = segment.map
         if local.keyframes[-1].index != frame.index:
             return
@@ -174,57 +167,51 @@ class KeyframeOdometry:
         points = int(local.known(local.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
-            for before in self._state.segments[:-1]:
+            for before in self._segments[:-1]:
                 before.map.forget_images()
             self._note(frame.index, "map begun", support=points)
 
     def locates(self, first: int, last: int) -> bool:
         """Whether two of the last frames both have a pose in the newest map."""
-        frames = self._state.segments[-1].frames[-_LAST_FRAMES:] if self._state.segments else []
+        frames = self._segments[-1].frames[-_LAST_FRAMES:] if self._segments else []
         located = {frame.index for frame in frames if frame.T_camera_world is not None}
         return {first, last} <= located
 
     def _begin(self, frame: Frame) -> None:
         """A new map whose first keyframe is this frame."""
-        state = self._state
-        if state.lost:
-            self._note(state.segments[-1].frames[-state.lost].index, "lost")
-        state.segments.append(MapSegment())
-        state.T_camera_world, state.lost = np.eye(4), 0
-        self._add_keyframe(state.segments[-1], frame, *_NOTHING)
+        if self._lost:
+            self._note(self._segments[-1].frames[-self._lost].index, "lost")
+        self._segments.append(MapSegment())
+        self._T_camera_world, self._lost = np.eye(4), 0
+        self._add_keyframe(self._segments[-1], frame, *_NOTHING)
 
     def _track(self, segment: MapSegment, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a turn."""
-        state, keyframe = self._state, segment.map.keyframes[-1]
-        rows = np.flatnonzero(~state.slipped)
+        keyframe = segment.map.keyframes[-1]
+        rows = np.flatnonzero(~self._slipped)
         if keyframe.grey is None or not len(rows):
             return _NOTHING
-        guesses = state.places[rows]
+        guesses = self._places[rows]
         if turn is not None and turn.correlation > _LEAST_CORRELATION:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
-        found, kept = flow(
-            keyframe.grey,
-            frame.grey,
-            keyframe.places[rows].astype(np.float32),
-            guesses,
-            _PYRAMID_LEVELS,
-        )
-        shift = np.median(found[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
-        state.places[rows] = np.where(kept[:, None], found, guesses + shift)
-        return keyframe.track_ids[rows[kept]], found[kept]
+        corners = keyframe.places[rows].astype(np.float32)
+        tracked, kept = track(keyframe.grey, frame.grey, corners, OF_KEYFRAMES, guesses)
+        shift = np.median(tracked[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
+        self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
+        return keyframe.track_ids[rows[kept]], tracked[kept]
 
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
         """The camera's pose from known points; whether there are enough."""
-        state, known = self._state, segment.map.known(track_ids)
-        places, pixels = pixels, in_middle_row(pixels, state.turn, self._intrinsics)
+        known = segment.map.known(track_ids)
+        places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
         pose = self._resected(segment, track_ids[known], pixels[known])
         if pose is None:
             return False
-        state.lost = 0
-        before, state.T_camera_world = state.T_camera_world, pose.T_camera_world
-        state.T_last_step = state.T_camera_world @ invert(before)
+        self._lost = 0
+        before, self._T_camera_world = self._T_camera_world, pose.T_camera_world
+        self._T_last_step = self._T_camera_world @ invert(before)
         slipped = track_ids[known][pose.residual_px > _SLIPPED * INLIER_PX]
-        state.slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
+        self._slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
         parallax_ratio = self._parallax_ratio(segment, track_ids, pixels)
@@ -235,33 +222,33 @@ class KeyframeOdometry:
         segment.frames.append(self._tracked(frame, track_ids, pixels))
         return True
 
-    def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
+    def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
         """From the last pose and from the predicted one; None with too few inliers."""
         if len(track_ids) < MIN_POINTS:
             return None
-        T_last = self._state.T_camera_world
-        guesses = T_last, self._state.T_last_step @ T_last
+        T_last = self._T_camera_world
+        guesses = T_last, self._T_last_step @ T_last
         points = segment.map.points[track_ids]
         if self._spread is None:
             self._spread = segment.map.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.map.keyframes[-1].track_ids, track_ids)]
         before = np.isin(track_ids, segment.frames[-1].track_ids) if segment.frames else np.zeros(0, np.bool_)
         trusted = before if before.sum() >= MIN_POINTS else None
-        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed, spread, trusted)
-        return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
+        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics.K, self._seed, spread, trusted)
+        return pose if len(pose.inliers) >= MIN_POINTS else None
 
     def _check_first_motion(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> None:
         """The best motion since the last keyframe, and its points, where these had no parallax before."""
-        local, before, state = segment.map, segment.map.keyframes[-1], self._state
+        local, before = segment.map, segment.map.keyframes[-1]
         rows = np.searchsorted(before.track_ids, track_ids)
         known = local.known(track_ids)
         if local.parallax(_LOOKED_BACK).settled[track_ids].sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
         tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, local.points[tracks])[:, 2]
-        T = state.T_camera_world @ invert(before.T_camera_world)
+        T = self._T_camera_world @ invert(before.T_camera_world)
         T_now_before, depth = first_motion(T, pixels_before, now, depth, self._intrinsics, self._seed)
-        state.T_camera_world = T_now_before @ before.T_camera_world
+        self._T_camera_world = T_now_before @ before.T_camera_world
         points = self._intrinsics.rays(pixels_before) * depth[:, None]
         local.points[tracks] = apply(invert(before.T_camera_world), points)
 
@@ -279,34 +266,36 @@ class KeyframeOdometry:
         last, intrinsics = segment.map.keyframes[-1], self._intrinsics
         if not len(track_ids):
             return 0.0
-        R = self._state.T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
+        R = self._T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
         rays_before = intrinsics.rays(last.pixels[np.searchsorted(last.track_ids, track_ids)])
-        parallax = parallax_px(rays_before, intrinsics.rays(pixels.astype(np.float64)), R, intrinsics)
+        parallax = parallax_px(
+            rays_before, intrinsics.rays(pixels.astype(np.float64)), R, (intrinsics.fx, intrinsics.fy)
+        )
         return float(np.median(parallax)) / intrinsics.width
 
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""
         self._on_keyframe(frame)
-        state, config, intrinsics, local = self._state, self._config, self._intrinsics, segment.map
-        T, is_tracked = state.T_camera_world, len(track_ids) > 0
+        config, intrinsics, local = self._config, self._intrinsics, segment.map
+        T, is_tracked = self._T_camera_world, len(track_ids) > 0
         if is_tracked:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
-            again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
-            track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
+            again, reprojected = local.found_again(frame.grey, T, track_ids, intrinsics)
+            track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels))
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)
         track_ids, places = track_ids[order], pixels[order].astype(np.float64)
         unknown = np.full(len(track_ids), np.nan)
-        middle, descriptors = in_middle_row(places, state.turn, intrinsics), describe(frame.grey, places)
+        middle, descriptors = in_middle_row(places, self._turn_rate, intrinsics), describe(frame.grey, places)
         local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
         if is_tracked:
             gone = local.adjust(intrinsics)
             local.keyframes[-1] = local.keyframes[-1].without(gone)
-            state.T_camera_world = local.keyframes[-1].T_camera_world
-        state.places = local.keyframes[-1].places.astype(np.float32)
-        state.slipped = np.zeros(len(state.places), np.bool_)
+            self._T_camera_world = local.keyframes[-1].T_camera_world
+        self._places = local.keyframes[-1].places.astype(np.float32)
+        self._slipped = np.zeros(len(self._places), np.bool_)
         self._spread = None
 
     def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
@@ -315,12 +304,12 @@ class KeyframeOdometry:
             return
         before = segment.frames[-1] if segment.frames else segment.map.keyframes[-1]
         _, a, b = np.intersect1d(before.track_ids, track_ids, assume_unique=True, return_indices=True)
-        self._state.turn = measured_turn(before.pixels[a], pixels[b], seconds, self._state.turn, self._intrinsics)
+        self._turn_rate = measured_turn(before.pixels[a], pixels[b], seconds, self._turn_rate, self._intrinsics)
 
     def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
         """Keep an event and log it."""
-        self._state.events.append(TrackingEvent(frame, event, other, support))
-        logger.info("%s", self._state.events[-1])
+        self._events.append(TrackingEvent(frame, event, other, support))
+        logger.info("%s", self._events[-1])
 
     def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
-        return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world)
+        return TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world)

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
-from slam.frontend.keyframes.camera_pose import MIN_POINTS
 from slam.frontend.keyframes.depth_prior import Parallax
 from slam.frontend.keyframes.joining import moved
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.unit import learned_units
+from slam.geometry.resection import MIN_POINTS
 from slam.geometry.se3 import FloatArray, chain, invert
 
 _PIXEL_SIGMA = 0.5  # of a sighting, pixels
@@ -69,8 +68,8 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
             parts[part[k]].frames.append(frame)
         elif frame.T_camera_world is not None and frame.index != starts[k]:
             parts[before[k]].turns.append(_turn(keyframes[k], frame.index, frame.T_camera_world))
-    for each in parts:
-        each.turns.sort(key=lambda turn: turn.to_index)
+    for piece in parts:
+        piece.turns.sort(key=lambda turn: turn.to_index)
     return parts
 
 
@@ -120,8 +119,8 @@ def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
     sigmas = []
     for keyframe in local.keyframes:
         tracks = keyframe.track_ids[local.known(keyframe.track_ids)]
-        own = np.maximum(pixel / np.maximum(parallax.angle[tracks], 1e-6), _POINT_SIGMA)
-        sigmas.append(1.0 / np.sqrt(max(_INDEPENDENT * float((own**-2.0).sum()) / max(len(tracks), 1), 1e-9)))
+        depth_sigmas = np.maximum(pixel / np.maximum(parallax.angle[tracks], 1e-6), _POINT_SIGMA)
+        sigmas.append(1.0 / np.sqrt(max(_INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1), 1e-9)))
         parallax.see(keyframe.T_camera_world, tracks)
     return np.array(sigmas[1:])
 

@@ -10,12 +10,11 @@ from itertools import pairwise
 import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
-from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.keyframes.floor import units_by_floor
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.visual.two_view import CORNER_CORRELATION
+from slam.geometry.resection import MIN_POINTS, resect
 from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_LENGTH = 1e-6
@@ -67,11 +66,12 @@ class KeyframePoses:
         number = self.segments.get(first)
         if number is None or number != self.segments.get(last):
             return None
-        apart = self._T_map_camera[last][:3, 3] - self._T_map_camera[first][:3, 3]
+        apart = self.T_map_camera[last][:3, 3] - self.T_map_camera[first][:3, 3]
         return self.learned_units[number] * float(np.linalg.norm(apart))
 
     @cached_property
-    def _T_map_camera(self) -> dict[int, FloatArray]:
+    def T_map_camera(self) -> dict[int, FloatArray]:
+        """Poses of the frames in the first frame of each map, or of maps that turns link."""
         return chained(self.poses)
 
     def frames_of(self, segment: int) -> list[int]:
@@ -97,9 +97,9 @@ def keyframe_poses(
     maps = [segment for segment in maps if segment.started]
     learned = [learned_unit(segment.map) for segment in maps]
     for number, segment in enumerate(maps):
-        found = _segment_poses(segment, intrinsics, seed)
-        poses += found
-        segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
+        located = _segment_poses(segment, intrinsics, seed)
+        poses += located
+        segments |= dict.fromkeys((frame for pose in located for frame in pose.ends), number)
         turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
     outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
@@ -120,11 +120,11 @@ def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
 def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
     local, keyframes = segment.map, segment.map.keyframes
     place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
-    found: list[RelativePose] = []
+    poses: list[RelativePose] = []
     for before, after in pairwise(keyframes):
         seen = _seen_from(local, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed)
         sigmas = None if seen is None else seen[1]
-        found.append(_relative(before, after.index, after.T_camera_world, sigmas))
+        poses.append(_relative(before, after.index, after.T_camera_world, sigmas))
     T_guess = keyframes[0].T_camera_world
     for frame in segment.frames:
         if frame.index in place:
@@ -136,14 +136,14 @@ def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> li
         if located is not None:
             T_guess, sigmas = located
             nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
-            found.append(_relative(nearest, frame.index, T_guess, sigmas))
-    return found
+            poses.append(_relative(nearest, frame.index, T_guess, sigmas))
+    return poses
 
 
 def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, seed: int) -> dict[Ends, RelativePose]:
     """Between keyframes of this map, their sigmas by the points that both see."""
     keyframes = {keyframe.index: keyframe for keyframe in local.keyframes}
-    found = {}
+    closing = {}
     for first, last in loops:
         if first not in keyframes or last not in keyframes:
             continue
@@ -152,8 +152,8 @@ def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, 
         T = after.T_camera_world
         seen = _seen_from(local, after.track_ids[both], after.pixels[both], T, intrinsics, seed)
         pose = _relative(before, last, T, None if seen is None else seen[1])
-        found[first, last] = replace(pose, source=LOOP_SOURCE)
-    return found
+        closing[first, last] = replace(pose, source=LOOP_SOURCE)
+    return closing
 
 
 def _seen_from(
@@ -168,8 +168,8 @@ def _seen_from(
     known = local.known(track_ids)
     if known.sum() < MIN_POINTS:
         return None
-    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, seed)
-    if (pose.residual_px < INLIER_PX).sum() < MIN_POINTS or not np.isfinite(pose.sigmas).all():
+    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics.K, seed)
+    if len(pose.inliers) < MIN_POINTS or not np.isfinite(pose.sigmas).all():
         return None
     return pose.T_camera_world, CORNER_CORRELATION * pose.sigmas
 
@@ -181,8 +181,8 @@ def _relative(
     T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
     length = float(np.linalg.norm(T_from_to[:3, 3]))
     floors = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3)
-    own = 10.0 * floors if sigmas is None else sigmas
-    return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), KEYFRAME_SOURCE)
+    by_points = 10.0 * floors if sigmas is None else sigmas
+    return RelativePose(keyframe.index, index, T_from_to, np.hypot(by_points, floors), KEYFRAME_SOURCE)
 
 
 def chained(poses: Sequence[RelativePose]) -> dict[int, FloatArray]:

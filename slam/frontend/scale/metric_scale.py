@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from slam.config.sections import LengthConfig, ScaleMode
+from slam.config.sections import ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
@@ -89,7 +89,6 @@ def find_scale(
     camera_height_m: float | None,
     drive: Drive,
     lidar_steps: Sequence[RelativePose],
-    lengths: LengthConfig,
 ) -> Scale:
     """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps).
 
@@ -118,7 +117,7 @@ def find_scale(
     if not isinstance(by_planes, MeasurementFailure):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         evidence = evidence.without_contradicted(_MAX_CONTRADICTION)
-    solved = solve_lengths(evidence, lengths)
+    solved = solve_lengths(evidence)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]
     misfit = np.abs(evidence.absolute - np.log(solved.length))

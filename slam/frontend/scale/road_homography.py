@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import RoadConfig
 from slam.frames import Frame, Intrinsics, Mask, resized_mask
 from slam.frontend.failure import MeasurementFailure
 from slam.geometry.robust import mad_sigma
@@ -33,6 +32,7 @@ _STEPS_KEPT = 100
 
 _Layer = NDArray[np.float32]
 _FAR_HEIGHTS = 9.0  # farthest ground used, in camera heights
+NEAR_HEIGHTS = 4.5  # farthest ground of the short strip, used behind a vehicle ahead, in camera heights
 _HALF_WIDTH_HEIGHTS = 1.0  # half the width of the strip of ground used, in camera heights
 _NEAR_HALF_WIDTH_HEIGHTS = 2.0  # half the width of the short strip, in camera heights
 # relative sigmas of independent errors that add up as those of neighbouring lengths do, which are correlated; single
@@ -78,11 +78,11 @@ class RoadHomography:
     short and wide one is used, which ends before such a car; it is less accurate.
     """
 
-    def __init__(self, config: RoadConfig, intrinsics: Intrinsics) -> None:
+    def __init__(self, intrinsics: Intrinsics) -> None:
         """Prepare for the first step."""
         self._intrinsics = intrinsics
         long = _Shape(_FAR_HEIGHTS, _HALF_WIDTH_HEIGHTS, _RELATIVE_SIGMA)
-        near = _Shape(config.near_heights, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)
+        near = _Shape(NEAR_HEIGHTS, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
         self._shapes = long, near
         self._standing: Mask | None = None

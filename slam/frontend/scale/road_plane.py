@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import ScaleConfig
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
@@ -21,6 +20,7 @@ _POINTS = 1500
 _LEAST_POINTS = 50
 _HYPOTHESES = 150
 _REWEIGHTINGS = 8
+_ROAD_ROWS = 0.35, 0.97  # top and bottom edge of the road, from horizon (0) to image bottom (1): above a bonnet
 _ROAD_TOP_WIDTH = 0.16  # width of the top edge over that of the image
 _ROAD_BOTTOM_WIDTH = 0.5  # width of the bottom edge over that of the image
 _MAX_TILT_DEG = 12.0  # largest angle between the plane's normal and the camera's y axis, degrees
@@ -40,10 +40,10 @@ class GroundPlane:
 class GroundPlaneFitter:
     """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
 
-    def __init__(self, config: ScaleConfig, intrinsics: Intrinsics, seed: int = 0) -> None:
+    def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
         self._seed = seed
-        self._rows, self._columns, self._rays = _trapezoid(intrinsics, config)
+        self._rows, self._columns, self._rays = _trapezoid(intrinsics)
 
     def fit(self, depth_unscaled: DepthMap, error: DepthError) -> GroundPlane | MeasurementFailure:
         """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics, without the bias by its ``error``.
@@ -70,14 +70,13 @@ class GroundPlaneFitter:
         return GroundPlane(height, normal, inlier_ratio)
 
 
-def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+def _trapezoid(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
     """Rows, columns ``(P,)`` and rays ``(P, 3)`` of about ``_POINTS`` pixels.
 
     The horizon is taken at cy (a level camera).
     """
     horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
-    shares = (config.road_top_ratio, config.road_bottom_ratio)
-    top_row, bottom_row = (horizon + share * (bottom - horizon) for share in shares)
+    top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
     area = intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
     step = max(1.0, float(np.sqrt(max(area, 1.0) / _POINTS)))
     rows_seen = np.unique(np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64))

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from slam.config.sections import LengthConfig
 from slam.frames import Ends
 from slam.frontend.visual.motion import Motion
 from slam.geometry.robust import running_median
@@ -30,6 +29,9 @@ _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
 _MOST_CORRELATED = 0.999
+# sigmas of logarithms: of a length by learned depth, measured on drives with truth, and least of the ratio of two steps
+_LEARNED_SIGMA, _RATIO_SIGMA = 0.1, 0.004
+OUTLIER_SIGMAS = 2.0  # residual at which the robust weight of a measurement is one half
 _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated points
 # factor on the sigma of a length by learned depth where the road gives it too, whose errors fewer neighbours share
 _BESIDE_ROAD = 4.0
@@ -124,12 +126,12 @@ def gather_evidence(
     return evidence
 
 
-def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
+def solve_lengths(evidence: StepEvidence) -> StepLengths:
     """Robust least squares on all evidence: Huber weights first, then Cauchy weights against outliers."""
     steps = len(evidence.learned)
     lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
-    ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, config.ratio_sigma)
-    learned_sigma = config.learned_sigma * np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
+    ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, _RATIO_SIGMA)
+    learned_sigma = _LEARNED_SIGMA * np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
     zero = np.full(steps, 2 * steps)  # behind the last state
     parts = [
@@ -151,14 +153,14 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         information, right = equations.normal(weights, idle)
         state = solveh_banded(information, right)
         residual = np.abs(equations.residual(state))
-        robust = 1.0 / (1.0 + (residual / config.outlier_sigmas) ** 2)
+        robust = 1.0 / (1.0 + (residual / OUTLIER_SIGMAS) ** 2)
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
     log_length, log_unit = state[lengths], state[units]
     known = np.where(measured[lengths], 1.0, np.nan)
     sigmas, correlations = marginals(information)
     correlated_sigmas = _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     sigmas, correlated_sigmas = known * sigmas, known * correlated_sigmas
-    by_learned = (evidence.learned + log_unit - log_length) / config.learned_sigma
+    by_learned = (evidence.learned + log_unit - log_length) / _LEARNED_SIGMA
     by_speed = (np.diff(log_length, prepend=np.nan) - evidence.steady) / (evidence.steady_sigma + _LENGTH_SIGMA)
     contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (np.abs(by_speed) > _CONTRADICTION_SIGMAS)
     return StepLengths(known * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted)

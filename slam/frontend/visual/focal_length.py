@@ -11,8 +11,8 @@ from typing import Self
 
 import numpy as np
 
-from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.residuals import Residuals, tangent_of
+from slam.geometry.epipolar import UnitRelativePose
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
 
@@ -60,5 +60,5 @@ class FocalLength:
         weighted = by_motion * weights
         normal = weighted @ by_motion.T + 1e-9 * np.eye(len(by_motion))
         explained = by_focal - np.linalg.solve(normal, weighted @ by_focal) @ by_motion
-        information, gradient = (float(explained @ (weights * each)) for each in (by_focal, residual))
+        information, gradient = (float(explained @ (weights * by)) for by in (by_focal, residual))
         return type(self)(self.information + information, self.gradient + gradient)

@@ -71,10 +71,10 @@ class Motion:
             relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
             noise: of rotation and direction, added in squares to that of the corners.
         """
-        own = self.own_noise
+        corners = self.own_noise
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / self.length_unscaled
-        rotation, direction = np.hypot(own.rotation, noise.rotation), np.hypot(own.direction, noise.direction)
+        rotation, direction = np.hypot(corners.rotation, noise.rotation), np.hypot(corners.direction, noise.direction)
         sigmas, correlated_sigmas = (
             pose_sigmas(T_previous_current, rotation, direction, sigma)
             for sigma in (relative_sigma, relative_correlated_sigma)
@@ -82,6 +82,25 @@ class Motion:
         return replace(
             self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas, correlated_sigmas=correlated_sigmas
         )
+
+
+@dataclass(frozen=True)
+class RelativeRotation:
+    """The rotation from one frame to another some steps later, measured on these two images alone.
+
+    ``R_to_from`` ``(3, 3)`` takes points of the earlier camera to the axes of the later one; ``sigmas`` ``(3,)`` are
+    those of its rotation vector in the later camera, radians.
+    """
+
+    from_index: int
+    to_index: int
+    R_to_from: FloatArray
+    sigmas: FloatArray
+
+    @property
+    def ends(self) -> Ends:
+        """Both frames."""
+        return self.from_index, self.to_index
 
 
 def pose_sigmas(

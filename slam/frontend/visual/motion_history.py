@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.geometry.epipolar import UnitRelativePose
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
 

@@ -10,30 +10,32 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, RelativePose, nearest_depth, trusted_depth
-from slam.frontend.failure import MeasurementFailure
-from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.dynamic_mask import DynamicMask
-from slam.frontend.visual.epipolar import (
-    UnitRelativePose,
-    depth_in_current,
-    parallax_px,
-    rotation_between,
-    triangulated_depth,
-    triangulated_nearness,
+from slam.frames import (
+    DepthMap,
+    Ends,
+    Frame,
+    Image,
+    Intrinsics,
+    Mask,
+    RelativePose,
+    nearest_depth,
+    resized_depth,
+    trusted_depth,
 )
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.tracking import CornerTracker, Tracks
+from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
-from slam.frontend.visual.motion import Motion, pose_sigmas
+from slam.frontend.visual.motion import Motion, RelativeRotation, pose_sigmas
 from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.moving_regions import DynamicMask
 from slam.frontend.visual.predicted_flow import PredictedFlow
-from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.frontend.visual.step_check import Step, most_credible
-from slam.frontend.visual.tracking import CornerTracker, Tracks
-from slam.frontend.visual.triangulated_points import TriangulatedPoints
+from slam.frontend.visual.step_check import Step, TriangulatedPoints, most_credible
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
     DEPTH_RELATIVE_SIGMA,
@@ -42,8 +44,15 @@ from slam.frontend.visual.two_view import (
     TwoViewEstimate,
     TwoViewEstimator,
 )
-from slam.frontend.visual.working_size import WorkingSize
-from slam.geometry.resection import consensus, refine
+from slam.geometry.epipolar import (
+    UnitRelativePose,
+    depth_in_current,
+    parallax_px,
+    rotation_between,
+    triangulated_depth,
+    triangulated_nearness,
+)
+from slam.geometry.resection import consensus, resect
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
 
@@ -65,6 +74,9 @@ _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stand
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
 _ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
+# corners are measured in images of a megapixel at most: larger ones are no sharper, their pixels have more noise and
+# less contrast, corners crowd on few objects, and the time grows with them
+_MOST_PIXELS = 1e6
 _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degrees
 
 
@@ -99,6 +111,7 @@ class VisualOdometry:
         self._config = config
         self._working = WorkingSize(intrinsics)
         self._intrinsics = intrinsics = self._working.camera
+        self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
         self._tracker = CornerTracker(config)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, seed)
@@ -189,11 +202,11 @@ class VisualOdometry:
                 return None
             votes, learned = np.ones(len(tracks), dtype=bool), nearest_depth(depth_first_unscaled, tracks.previous)
             matches = self._matches(tracks, votes, learned, None, mask, error)
-            found = self._two_views.refined(matches, known[0])
-            if found is None or found.inliers.sum() < self._config.min_inliers:
+            estimate = self._two_views.refined(matches, known[0])
+            if estimate is None or estimate.inliers.sum() < self._config.min_inliers:
                 return None
-            sigmas = np.sqrt(np.diag(found.covariance)[:3])
-            return RelativeRotation(first.index, last.index, found.unit_pose.R_current_previous, sigmas)
+            sigmas = np.sqrt(np.diag(estimate.covariance)[:3])
+            return RelativeRotation(first.index, last.index, estimate.unit_pose.R_current_previous, sigmas)
 
         return measure
 
@@ -253,7 +266,7 @@ class VisualOdometry:
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
         # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
-        unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._intrinsics)
+        unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._focal)
         if np.median(unexplained) < _MIN_PARALLAX_PX:
             return None
         history = self._state.history
@@ -310,7 +323,7 @@ class VisualOdometry:
         """The step with its length by learned depth, None with too few points for that."""
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         unit_pose = two_view.unit_pose
-        parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._intrinsics)
+        parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._focal)
         depth_previous = triangulated_depth(rays_previous, rays_current, unit_pose)
         solid = two_view.inliers & (depth_previous > 0) & (parallax > _MIN_POINT_PARALLAX_PX)
         measures = solid & np.isfinite(depth)
@@ -331,8 +344,8 @@ class VisualOdometry:
         last, earlier = self._state.last, self._state.points
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
         ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
-        own, relative = np.sqrt(np.diag(covariance)), max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
-        sigmas = pose_sigmas(T_previous_current, own[:3], own[3:], relative)
+        corner_sigmas, relative = np.sqrt(np.diag(covariance)), max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
+        sigmas = pose_sigmas(T_previous_current, corner_sigmas[:3], corner_sigmas[3:], relative)
         pose = RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE)
         motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)
@@ -347,19 +360,44 @@ class VisualOdometry:
         corrected = self._state.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
-        found = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
-        count = 0 if found is None else len(found[2])
-        if found is None or count < max(self._config.min_inliers, _LEAST_PNP_SHARE * len(pixels)):
+        start = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
+        count = 0 if start is None else len(start[1])
+        if start is None or count < max(self._config.min_inliers, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
             return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
-        resection = refine(points_previous, pixels, K, found)
-        self._state = replace(self._state, fitted=tracks.track_ids[known][found[2]])
-        length = float(np.linalg.norm(resection.T_camera_points[:3, 3]))
+        T_start, inliers = start
+        resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
+        self._state = replace(self._state, fitted=tracks.track_ids[known][inliers])
+        length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
-        pose = RelativePose(*ends, invert(resection.T_camera_points), sigmas, PNP_SOURCE)
+        pose = RelativePose(*ends, invert(resection.T_camera_world), sigmas, PNP_SOURCE)
         return Motion(pose, support=count / tracks.sought)
+
+
+class WorkingSize:
+    """Reduces images and depth of one camera; those of at most a megapixel stay as they are."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        """``camera`` is that of the reduced images."""
+        ratio = float(np.sqrt(_MOST_PIXELS / (intrinsics.width * intrinsics.height)))
+        size = round(ratio * intrinsics.width), round(ratio * intrinsics.height)
+        self.camera = intrinsics if ratio >= 1.0 else intrinsics.resized(*size)
+        self._size = self.camera.width, self.camera.height
+
+    def frame(self, frame: Frame) -> Frame:
+        """The frame with its reduced image."""
+
+        def reduced() -> Frame:
+            image: Image = np.asarray(cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8)
+            return Frame(frame.index, frame.stamp, image)
+
+        return frame if frame.image.shape[1::-1] == self._size else frame.derived(("reduced", self._size), reduced)
+
+    def depth(self, depth: DepthMap) -> DepthMap:
+        """The depth map ``(h, w)`` of the reduced image."""
+        return depth if depth.shape[::-1] == self._size else resized_depth(depth, *self._size)
 
 
 def _with_floors(two_view: TwoViewEstimate) -> FloatArray:

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics
-from slam.frontend.sparse_flow import Pixels
-from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.geometry.epipolar import UnitRelativePose
 
 _NEAREST = 1e-6
 _INVERSIONS = 2
@@ -41,7 +40,7 @@ class PredictedFlow:
         """The later image ``(H, W)`` warped to the earlier one, equal to it where the prediction is right."""
         return np.asarray(cv2.remap(current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
-    def in_current(self, pixels: Pixels) -> Pixels:
+    def in_current(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Where pixels ``(M, 2)`` of the warped image lie in the later one."""
         if len(pixels) == 0:
             return pixels

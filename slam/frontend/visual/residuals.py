@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from slam.frontend.visual.epipolar import UnitRelativePose, cross
+from slam.geometry.epipolar import UnitRelativePose, cross
 from slam.geometry.se3 import FloatArray
 
 # hat(w) row by row, by each component of w

@@ -11,18 +11,48 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slam.frontend.visual.epipolar import triangulated_depth
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
-from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.visual.two_view import Matches, TwoViewEstimate
+from slam.geometry.epipolar import triangulated_depth
+from slam.geometry.robust import mad_sigma, weighted_median
+from slam.geometry.se3 import FloatArray
 
 # largest log of a length over the same by the road or by triangulated points
 _AGREEMENT = 0.25
 _LEAST_ROAD_CORNERS = 8
 # least sigma of the direction of motion, radians
 _AXIS_SIGMA = float(np.deg2rad(8.0))
+_LEAST_COMMON = 12  # points by which two steps compare their lengths
+
+
+@dataclass(frozen=True)
+class TriangulatedPoints:
+    """``M`` scene points that a step triangulated, by the identifiers of their tracks ``track_ids`` ``(M,)``.
+
+    z-depths ``(M,)`` in both cameras are in units of the step's length, ``relative_sigma`` ``(M,)`` is that of both.
+    """
+
+    track_ids: NDArray[np.int64]
+    depth_previous: FloatArray
+    depth_current: FloatArray
+    relative_sigma: FloatArray
+
+    def length_ratio(self, earlier: TriangulatedPoints) -> tuple[float, float] | None:
+        """Log of this step's length over that of an earlier one that ends where this begins, with its sigma.
+
+        In the frame between, a point's depth is ``|t| z`` by either step; None with too few common points.
+        """
+        _, first, second = np.intersect1d(earlier.track_ids, self.track_ids, assume_unique=True, return_indices=True)
+        if len(first) < _LEAST_COMMON:
+            return None
+        logarithms = np.log(earlier.depth_current[first] / self.depth_previous[second])
+        weights = 1.0 / (earlier.relative_sigma[first] ** 2 + self.relative_sigma[second] ** 2)
+        middle = weighted_median(logarithms, weights)
+        deviation = mad_sigma(logarithms - middle)
+        return middle, deviation / float(np.sqrt(len(first)))
 
 
 @dataclass(frozen=True)
@@ -53,10 +83,10 @@ def most_credible(
     history: MotionHistory,
 ) -> Step | None:
     """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
-    found = [step for step in steps if step is not None]
-    balance = [sum(_votes(step, matches, height_unscaled, seconds, history)) for step in found]
+    estimated = [step for step in steps if step is not None]
+    balance = [sum(_votes(step, matches, height_unscaled, seconds, history)) for step in estimated]
     best = int(np.argmax(balance))
-    return found[best] if balance[best] >= 0 else None
+    return estimated[best] if balance[best] >= 0 else None
 
 
 def _votes(

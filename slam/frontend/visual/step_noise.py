@@ -1,9 +1,8 @@
 """Noise of the steps of a drive besides the covariance of corners, estimated from the drive without ground truth.
 
 The covariance of corners holds for an ideal pinhole. Time stamps, the mount and the lens add errors, which grow with
-the camera's rotation jitter, its rotation, and the residual of a step to its neighbours. So the sigmas of each step
-are inflated by ratios of the part of these that the noise of corners does not explain. The ratios in
-``VisualOdometryConfig`` were fitted once (``docs/design/noise-and-the-pose-graph.md``).
+the camera's rotation jitter and the residual of a step to its neighbours. So the sigmas of each step are inflated by
+ratios of the part of these that the noise of corners does not explain.
 """
 
 from __future__ import annotations
@@ -14,10 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.config.sections import VisualOdometryConfig
 from slam.geometry.robust import mad_sigmas
 from slam.geometry.se3 import FloatArray, invert
 
+# sigmas over the jitter and over the residual, by Student's t on KITTI 00 and five simulated drives; ratios of other
+# drives cover no better (docs/design/noise-and-the-pose-graph.md)
+JITTER_ROTATION, JITTER_DIRECTION = 0.33, 8.5
+NEIGHBOUR_ROTATION, NEIGHBOUR_DIRECTION = 0.25, 1.0
 _LEAST_STEPS = 20
 # a third difference of white noise has 1 + 9 + 9 + 1 times its variance
 _THIRD_DIFFERENCE = np.sqrt(20.0)
@@ -37,14 +39,13 @@ class StepNoise:
 
 
 def inflate_step_sigmas(
-    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise], config: VisualOdometryConfig
+    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise]
 ) -> dict[int, StepNoise]:
     """The noise of each step of a drive besides that of the corners.
 
     Args:
         T_previous_current: steps by their order in the drive, neighbours one apart; lengths are not used.
         own: the sigmas by the covariance of corners.
-        config: the ratios.
     """
     if not T_previous_current:
         return {}
@@ -52,20 +53,17 @@ def inflate_step_sigmas(
     directions = {k: _unit(invert(T)[:3, 3]) for k, T in T_previous_current.items()}
     jitter = _unexplained(rotation_jitter(rotations), np.median([own[k].rotation for k in rotations], axis=0))
     noise = {}
-    for k, rotation in rotations.items():
+    for k in rotations:
         rotation_residual, direction_residual = (
             _unexplained(neighbour_residual(values, k), _NEIGHBOUR_RESIDUAL_OF_NOISE * known)
             for values, known in ((rotations, own[k].rotation), (directions, own[k].direction))
         )
-        rotation_sigmas = [
-            config.jitter_rotation_ratio * jitter,
-            config.turn_rotation_ratio * rotation,
-            config.neighbour_rotation_ratio * rotation_residual,
-        ]
         across = np.sqrt(np.maximum(1.0 - directions[k] ** 2, 0.0))
-        jitter_sigma = config.jitter_direction_ratio * np.linalg.norm(jitter) * across
-        direction = np.hypot(jitter_sigma, config.neighbour_direction_ratio * direction_residual)
-        noise[k] = StepNoise(np.linalg.norm(rotation_sigmas, axis=0), direction)
+        jitter_sigma = JITTER_DIRECTION * np.linalg.norm(jitter) * across
+        noise[k] = StepNoise(
+            rotation=np.hypot(JITTER_ROTATION * jitter, NEIGHBOUR_ROTATION * rotation_residual),
+            direction=np.hypot(jitter_sigma, NEIGHBOUR_DIRECTION * direction_residual),
+        )
     return noise
 
 

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import VisualOdometryConfig
-from slam.frontend.visual.epipolar import (
+from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
+from slam.frontend.visual.moving_regions import moving_corners
+from slam.frontend.visual.residuals import Residuals, tangent_of
+from slam.geometry.epipolar import (
     UnitRelativePose,
     triangulated_depth,
     unit_pose_by_essential,
     unit_pose_by_pnp,
 )
-from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
-from slam.frontend.visual.moving_regions import moving_corners
-from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry.robust import mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix
 
@@ -121,10 +121,10 @@ class TwoViewEstimator:
         candidates = [usual, best]
         if best is None or best.agreeing[votes].mean() < least:
             candidates.append(self._refined(matches, by_points(), prior))
-        found = [candidate for candidate in candidates if candidate is not None]
-        if not found:
+        estimates = [candidate for candidate in candidates if candidate is not None]
+        if not estimates:
             return None
-        return max(found, key=lambda candidate: _support(candidate, votes, prior))
+        return max(estimates, key=lambda candidate: _support(candidate, votes, prior))
 
     def refined(self, matches: Matches, start: UnitRelativePose) -> TwoViewEstimate | None:
         """The motion refined from a well-known ``start``.
@@ -219,8 +219,8 @@ class TwoViewEstimator:
         residuals = self._residuals(matches)
         ratios = [self._ratios(matches, motion, residuals)[0] for motion in motions if motion is not None]
         least = max(_LEAST_POINTS, _COMPARABLE_SUPPORT * max(map(len, ratios), default=0))
-        logarithms = [np.log(each) for each in ratios if len(each) >= least]
-        error = min((mad_sigma(each - np.median(each)) for each in logarithms), default=0.0)
+        logarithms = [np.log(of_motion) for of_motion in ratios if len(of_motion) >= least]
+        error = min((mad_sigma(logarithm - np.median(logarithm)) for logarithm in logarithms), default=0.0)
         return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
 
     def _length(self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals) -> float | None:

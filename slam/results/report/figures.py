@@ -10,14 +10,12 @@ from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.spatial.transform import Rotation
 
-from slam.evaluation.coverage import LEVELS
 from slam.evaluation.drift import aligned, paired, segment_drifts
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
-from slam.results.metrics import AcceptedLoop, CoverageMetrics, Stretch
+from slam.results.metrics import AcceptedLoop, Stretch
 from slam.results.report.map_view import MapView
 from slam.runtime.run_files import REFERENCE
-from slam.runtime.storage.record import known
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito (2008): for every eye
 LOOKS: dict[str, tuple[str, str | None, float, str]] = {  # label, colour (None: that of text), width, dash
@@ -61,39 +59,38 @@ def trajectories_figure(
 
 
 def map_figure(view: MapView) -> go.Figure:
-    """The map in its colours with the drive through it, seen first from one of its cameras."""
+    """The map in its colours with the camera's path through it, seen first from one of its places."""
     points, path = (X @ _R_UP_WORLD.T for X in (view.mesh.points, view.T_world_camera[:, :3, 3]))
     corners = view.mesh.triangles.astype(np.uint16 if len(points) < 2**16 else np.int32)
+    colours = [f"#{rgb:06x}" for rgb in view.mesh.colours.astype(np.int64) @ [1 << 16, 1 << 8, 1]]
+    flat = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
     figure = go.Figure(
         go.Mesh3d(
-            **dict(zip("xyz", map(_single, points.T), strict=True)),
-            **dict(zip("ijk", map(np.ascontiguousarray, corners.T), strict=True)),
-            vertexcolor=[f"#{rgb:06x}" for rgb in view.mesh.colours.astype(np.int64) @ [1 << 16, 1 << 8, 1]],
-            lighting={"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0},
+            **_by_axis("xyz", map(_single, points.T)),
+            **_by_axis("ijk", map(np.ascontiguousarray, corners.T)),
+            vertexcolor=colours,
+            lighting=flat,
             hoverinfo="skip",
         )
     )
-    line, places = {"color": COLOURS[0], "width": 4}, dict(zip("xyz", map(_single, path.T), strict=True))
-    figure.add_scatter3d(**places, mode="lines", line=line, hoverinfo="skip")
+    line = {"color": COLOURS[0], "width": 4}
+    figure.add_scatter3d(**_by_axis("xyz", map(_single, path.T)), mode="lines", line=line, hoverinfo="skip")
     # a unit of the scene is what is near, for it is clipped at a hundredth of one
     low, high = (f([f(points, axis=0), f(path, axis=0)], axis=0) for f in (np.min, np.max))
     size = np.maximum(high - low, 1e-3)
-    T_world_seat = view.T_world_camera[view.seat]
-    eye, ahead = (path[view.seat] + far * _R_UP_WORLD @ T_world_seat[:3, 2] for far in (0.0, view.ahead))
-    camera = {
-        name: dict(zip("xyz", ((X - 0.5 * (low + high)) / view.ahead).tolist(), strict=True))
-        for name, X in {"eye": eye, "center": ahead}.items()
-    }
-    axes = {
-        f"{axis}axis": {"visible": False, "range": [float(a), float(b)]}
-        for axis, a, b in zip("xyz", low, low + size, strict=True)
-    }
-    ratio = dict(zip("xyz", (size / view.ahead).tolist(), strict=True))
-    scene = axes | {
-        "camera": camera,
-        "dragmode": "turntable",
+    eye, forward = path[view.frame], _R_UP_WORLD @ view.T_world_camera[view.frame, :3, 2]
+    places = {"eye": eye, "center": eye + view.ahead * forward}
+    ranges = zip(low.tolist(), (low + size).tolist())
+    scene: dict[str, Any] = _by_axis(
+        ("xaxis", "yaxis", "zaxis"), ({"visible": False, "range": list(each)} for each in ranges)
+    )
+    scene |= {
+        "camera": {
+            name: _by_axis("xyz", ((X - 0.5 * (low + high)) / view.ahead).tolist()) for name, X in places.items()
+        },
+        "aspectratio": _by_axis("xyz", (size / view.ahead).tolist()),
         "aspectmode": "manual",
-        "aspectratio": ratio,
+        "dragmode": "turntable",
         "bgcolor": _SKY,
     }
     return figure.update_layout(scene=scene, height=_MAP, showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0})
@@ -117,13 +114,13 @@ def drift_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
     for name, estimate, truth in paired(trajectories):
         drifts = segment_drifts(estimate, truth)
         lengths = np.array([drift.length_m for drift in drifts])
-        values = (
-            (np.array([100.0 * drift.translation for drift in drifts]), "%{y:.2f} % of %{x} m"),
-            (np.rad2deg([100.0 * drift.rotation for drift in drifts]), "%{y:.3f} deg / 100 m over %{x} m"),
-        )
-        for row, (value, words) in enumerate(values, 1):
-            line = _line(name, lengths, value, None, words, mode="lines+markers", showlegend=row == 1)
-            figure.add_trace(line, row, 1)
+        percent = np.array([100.0 * drift.translation for drift in drifts])
+        degrees = np.rad2deg([100.0 * drift.rotation for drift in drifts])
+        line = _line(name, lengths, percent, None, "%{y:.2f} % of %{x} m", mode="lines+markers")
+        figure.add_trace(line, 1, 1)
+        words = "%{y:.3f} deg / 100 m over %{x} m"
+        line = _line(name, lengths, degrees, None, words, mode="lines+markers", showlegend=False)
+        figure.add_trace(line, 2, 1)
     figure.update_xaxes(title="segment length (m)", row=2)
     return figure.update_yaxes(rangemode="tozero")
 
@@ -174,21 +171,6 @@ def motion_figure(trajectories: Mapping[str, Trajectory], unit: str, gaps: Itera
     return _over_time(figure, last, gaps)
 
 
-def noise_figure(coverage: CoverageMetrics, by_source: Mapping[str, CoverageMetrics]) -> go.Figure:
-    """Share of factors inside the bounds of their stated noise, beside what the bounds promise."""
-    named = {"all": coverage} | dict(by_source)
-    names = [f"{name}<br>{number}" if (number := known(each.factors)) else name for name, each in named.items()]
-    figure = go.Figure()
-    for level, colour in zip(LEVELS, COLOURS[::-1]):
-        shares = [100.0 * (known(getattr(each, f"inside_{level}")) or 0.0) for each in named.values()]
-        words = f"%{{y:.0f}} % inside the {level} % bound<extra>%{{x}}</extra>"
-        bar = {"name": f"{level} % bound", "marker": {"color": colour}, "hovertemplate": words}
-        figure.add_trace(go.Bar(x=names, y=shares, **bar))
-        figure.add_hline(y=level, line={"color": colour, "dash": "dash", "width": 1.2})
-    figure.update_yaxes(title="factors inside (%)", range=(0, 104))
-    return figure.update_layout(height=_PANEL + 90)
-
-
 def _line(name: str, x: FloatArray, y: FloatArray, frames: Any, words: str, **more: Any) -> go.Scatter:
     """A line of a trajectory, which tells the frame under the pointer."""
     label, colour, width, dash = LOOKS.get(name, (name, None, 1.8, "solid"))
@@ -217,6 +199,10 @@ def _over_time(figure: go.Figure, trajectory: Trajectory, gaps: Iterable[Stretch
         ends = trajectory.stamps[[max(gap.first - 1, 0), min(gap.last + 1, len(trajectory) - 1)]]
         figure.add_vrect(*(ends - trajectory.stamps[0]), fillcolor="#8b949e", opacity=0.25, line_width=0)
     return figure.update_xaxes(title="time (s)", row=2)
+
+
+def _by_axis(names: Iterable[str], values: Iterable[Any]) -> dict[str, Any]:
+    return dict(zip(names, values, strict=True))
 
 
 def _single(values: FloatArray) -> Any:

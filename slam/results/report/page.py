@@ -1,24 +1,30 @@
-"""The report of a run: one self-contained page with a verdict, its inputs, errors and figures."""
+"""The report of a run: one page that opens offline and asks for nothing, with verdict, errors, figures and inputs."""
 
 from __future__ import annotations
 
+import base64
+import gzip
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from erfsfm.common.table import Table
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.metrics import METRES, LoopsFile, Metrics
-from slam.results.report import tables as report_tables
-from slam.results.report.map_report import map_errors_table, map_filters, map_sizes
+from slam.results.report import tables
 from slam.results.report.map_view import MapView
-from slam.results.report.rendering import Picture, render
-from slam.results.report.tables import Cell, Table, number
 from slam.results.report.verdict import verdict
+from slam.results.tables import alignments_table, errors_table, missing_errors
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.run_files import LOOPS, MEANINGS, REFERENCE, REPORT, TRAJECTORIES
-from slam.runtime.storage.record import MISSING, Missing, known
+from slam.runtime.run_files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
+from slam.runtime.storage.record import NOT_RECORDED
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -27,10 +33,30 @@ logger = logging.getLogger(__name__)
 
 _ALIGNED = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
 _AS_WRITTEN = "As written; no ground truth is known. The raw network chain is scaled to the rest."
-_NOISE = (
-    "Share of factors whose error at the truth lies inside a bound of their stated noise; dashed is what the bound "
-    "promises. Less means sigmas that are too small, more means sigmas that are too large."
+_TEMPLATES = Environment(
+    loader=PackageLoader("slam", "results/report"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
 )
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image, a plot as Plotly's JSON, or the ``reason`` why it could not be drawn; ``image`` is its address."""
+
+    title: str
+    caption: str
+    image: str = ""
+    plot: str = ""
+    reason: str = ""
+
+    @classmethod
+    def of_file(cls, title: str, caption: str, content: bytes, kind: str) -> Picture:
+        """A file of a ``kind`` such as png."""
+        return cls(title, caption, image=f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}")
 
 
 def write_report(
@@ -52,37 +78,41 @@ def write_report(
     Raises:
         RunError: ``metrics.json`` is damaged.
     """
-    metrics, loops_file = metrics or folder.metrics(), _loops_file(folder)
-    page = render(
-        "page.html.j2",
-        name=known(metrics.sequence.name) or folder.path.resolve().name,
+    metrics = metrics or folder.metrics()
+    said, errors = verdict(metrics), metrics.evaluated_errors()
+    no_errors, has_map = missing_errors(errors), metrics.map.triangles is not None
+    optimised = metrics.trajectories.optimised
+    page = _TEMPLATES.get_template("page.html.j2").render(
+        script=(files("slam.results.report") / "page.js").read_text("utf-8"),
+        plotly=_plotly,
+        name=metrics.sequence.name or folder.path.resolve().name,
         failure=metrics.failure,
-        verdict=verdict(metrics),
+        verdict=said,
         leak=metrics.provenance.leak is True,
-        version=known(metrics.provenance.version) or "",
+        version=metrics.provenance.version or "",
         unit_notes=metrics.unit_notes(),
-        key_numbers=[] if metrics.failure else report_tables.key_numbers(metrics),
-        what_ran=report_tables.what_ran(metrics),
-        plots=_plots(metrics, _trajectories(folder), loops_file, view),
-        errors=report_tables.errors(metrics),
-        gps=report_tables.gps(metrics),
-        no_errors=report_tables.no_errors(metrics),
+        key_numbers=[] if said is None else tables.key_numbers(metrics, has_map=not said.scraps),
+        what_ran=_html(tables.what_ran(metrics)),
+        plots=_plots(metrics, _trajectories(folder), _loops_file(folder), view),
+        errors=_html(errors_table(errors) if errors and not no_errors else None),
+        alignments=_html(alignments_table(optimised) if not optimised.absent and not no_errors else None),
+        no_errors=no_errors,
+        gps=_html(tables.gps(metrics)),
         depths=depths,
-        depth_error=_depth_error(metrics),
-        map=map_sizes(metrics),
-        map_filters=map_filters(metrics),
-        map_errors=map_errors_table(metrics),
-        no_map=_absence(metrics, metrics.map),
-        loops=report_tables.loops(metrics, loops_file),
+        depth_error=_html(tables.depth_error(metrics)),
+        map_tables=[_html(tables.map_errors(metrics)), _html(tables.map_left_out(metrics))],
+        no_map=_absence(metrics, metrics.map.absent or ("" if has_map else metrics.map.why("triangles"))),
+        loops=tables.loop_counts(metrics),
         loop_pictures=loops,
-        no_loops=_absence(metrics, metrics.loops),
-        tracking=report_tables.tracking(metrics),
-        graph=report_tables.graph(metrics),
-        timing=report_tables.timing(metrics),
-        alignments=report_tables.alignments(metrics),
-        files=_files(folder),
+        no_loops=_absence(metrics, metrics.loops.absent),
+        timing=_html(tables.timing(metrics)),
+        files=_html(tables.files(folder)),
     )
     folder.write_text(REPORT, page)
+
+
+def _html(table: Table | None) -> Markup:
+    return Markup("" if table is None else table.html())
 
 
 def _loops_file(folder: RunFolder) -> LoopsFile:
@@ -93,84 +123,9 @@ def _loops_file(folder: RunFolder) -> LoopsFile:
         return LoopsFile()
 
 
-def _absence(metrics: Metrics, part: object) -> str:
+def _absence(metrics: Metrics, reason: str) -> str:
     """Why a run has no such part; empty where it has one, or failed before."""
-    if not isinstance(part, Missing) or (metrics.failure and part == MISSING):
-        return ""
-    return part.reason
-
-
-def _plots(
-    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: LoopsFile, view: MapView | None
-) -> dict[str, list[Picture]]:
-    """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
-    from slam.results.report import figures
-
-    found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": [], "noise": []}
-
-    def add(section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> None:
-        try:
-            found[section].append(Picture.of_plot(title, caption, draw(*given)))
-        except SlamError as error:
-            found[section].append(Picture(title, caption, reason=str(error)))
-
-    has_truth = REFERENCE in trajectories and len(trajectories) > 1
-    unit = "m" if metrics.unit == METRES else metrics.unit
-    gaps, accepted = known(metrics.sequence.bridged) or [], known(loops.accepted) or []
-    if trajectories:
-        given = (trajectories, "m" if has_truth else unit, accepted)
-        caption = _ALIGNED if has_truth else _AS_WRITTEN
-        add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
-    if has_truth:
-        how = "as written, the network after the 7-dof alignment" if metrics.is_metric else "after the 7-dof alignment"
-        caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
-        title = "Scale and rotation over time"
-        add("trajectories", title, caption, figures.scale_figure, trajectories, metrics.is_metric, gaps)
-        caption = "Distance to the true position, after the 7-dof alignment."
-        add("errors", "Position error along the path", caption, figures.error_figure, trajectories)
-        caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
-        add("errors", "Drift by the length of segments", caption, figures.drift_figure, trajectories)
-    elif trajectories:
-        caption = "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
-        add("trajectories", "Speed and rotation over time", caption, figures.motion_figure, trajectories, unit, gaps)
-    if view is not None:
-        caption = (
-            f"A thinned map_mesh.ply with the optimised trajectory, seen first from the camera of frame {view.seat}. "
-            "Drag to turn it, with the right button to move it; the wheel zooms."
-        )
-        add("map", "Map", caption, figures.map_figure, view)
-    if (coverage := known(metrics.graph.coverage)) is not None:
-        by_source = known(metrics.graph.coverage_by_source) or {}
-        add("noise", "Stated noise", _NOISE, figures.noise_figure, coverage, by_source)
-    return found
-
-
-def _depth_error(metrics: Metrics) -> Table | None:
-    """Error of learned depth over distance; None where it was not measured."""
-    rows = list(metrics.depth_error)
-    if not rows:
-        return None
-    words = (
-        "Learned depth against depth triangulated on the drive. The bias is taken out of learned depth before it is "
-        "compared with image geometry. It is zero on average, for its scale is measured step by step."
-    )
-    head = ("learned depth", "bias", "relative sigma", "corners")
-    cells = [[number(row.depth, 1), _signed(row.bias), number(row.sigma, 2), number(row.corners)] for row in rows]
-    return Table(head, cells, notes=[words])
-
-
-def _signed(value: float | Missing) -> Cell:
-    return number(value) if isinstance(value, Missing) else Cell(f"{value:+.2f}")
-
-
-def _files(folder: RunFolder) -> Table | None:
-    """Every other file of the run with its meaning and size."""
-    rows = []
-    for path in sorted(folder.path.iterdir()):
-        if path.is_file() and not path.name.startswith(".") and path.name != REPORT:
-            size = _size(path.stat().st_size)
-            rows.append([Cell(path.name, address=quote(path.name)), Cell(MEANINGS.get(path.name, "")), Cell(size)])
-    return Table((), rows, "words") if rows else None
+    return "" if metrics.failure and reason == NOT_RECORDED else reason
 
 
 def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
@@ -183,10 +138,54 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
     return {name: trajectory for name, trajectory in found.items() if trajectory is not None}
 
 
-def _size(count: int) -> str:
-    size = float(count)
-    for unit in ("B", "kB", "MB"):
-        if size < 1000.0:
-            return f"{size:.3g} {unit}"
-        size /= 1000.0
-    return f"{size:.3g} GB"
+def _plots(
+    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: LoopsFile, view: MapView | None
+) -> dict[str, list[Picture]]:
+    """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
+    from slam.results.report import figures
+
+    found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": []}
+
+    def add(section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> None:
+        try:
+            figure = draw(*given).update_layout(template={})  # page.js draws it in the colours of the page
+            plot = str(figure.to_json()).replace("<", "\\u003c")
+            found[section].append(Picture(title, caption, plot=plot))
+        except SlamError as error:
+            found[section].append(Picture(title, caption, reason=str(error)))
+
+    has_truth = REFERENCE in trajectories and len(trajectories) > 1
+    unit = "m" if metrics.unit == METRES else metrics.unit
+    gaps, accepted = metrics.sequence.bridged or [], loops.accepted or []
+    if trajectories:
+        given = (trajectories, "m" if has_truth else unit, accepted)
+        caption = _ALIGNED if has_truth else _AS_WRITTEN
+        add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
+    if has_truth:
+        how = "as written, the network after the 7-dof alignment" if metrics.is_metric else "after the 7-dof alignment"
+        caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
+        title = "Scale and rotation over time"
+        add("trajectories", title, caption, figures.scale_figure, trajectories, metrics.is_metric, gaps)
+        caption = "Distance to the true position, after the 7-dof alignment."
+        add("errors", "Position error along the path", caption, figures.error_figure, trajectories)
+        if metrics.trajectories.optimised.align.dof7.t_rel_percent is not None:
+            caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
+            add("errors", "Drift by the length of segments", caption, figures.drift_figure, trajectories)
+    elif trajectories:
+        caption = "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
+        add("trajectories", "Speed and rotation over time", caption, figures.motion_figure, trajectories, unit, gaps)
+    if view is not None:
+        caption = (
+            f"The map, thinned, and the camera's path, seen first from its place at frame {view.frame}. "
+            "Drag to turn it, with the right button to move it; the wheel zooms."
+        )
+        add("map", "Map", caption, figures.map_figure, view)
+    return found
+
+
+@cache
+def _plotly() -> str:
+    """The library as base64 of gzip, which ``unpacked`` of page.js reads."""
+    from plotly.offline import get_plotlyjs
+
+    return base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode("ascii")

@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Image, Intrinsics, View
-from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.residuals import Residuals
+from slam.geometry.epipolar import UnitRelativePose
 from slam.geometry.se3 import invert
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import Loop, matches
+from slam.loops.verification import Loop, LoopThresholds, matches
 from slam.mapping.filters import KeyframeDepth
-from slam.results.report.rendering import Picture
+from slam.results.report.page import Picture
 
 _EXAMPLES, _MOST_LOOPS, _MOST_LINES = 5, 6, 60
 _WIDTH_PX = 480
@@ -94,16 +93,14 @@ def _pair(loop: Loop, first: Image, second: Image, intrinsics: Intrinsics, thres
 def _joined(first: Image, second: Image, from_: NDArray[np.float32], to: NDArray[np.float32]) -> Image:
     """Both images, wide ones below each other, with a line for every corner ``(M, 2)``."""
     wide = first.shape[1] > 2 * first.shape[0]
-    above, below = _narrow(first, _WIDTH_PX), _narrow(second, _WIDTH_PX)
-    shift = np.array([0, above.shape[0]] if wide else [above.shape[1], 0])
-    joined = np.ascontiguousarray(np.vstack([above, below]) if wide else np.hstack([above, below]))
-    starts = np.rint(from_ * (above.shape[1] / first.shape[1])).astype(int)
-    ends = np.rint(to * (below.shape[1] / second.shape[1])).astype(int) + shift
-    for k, (start, end) in enumerate(zip(starts.tolist(), ends.tolist())):
-        colour = _LINES[k % len(_LINES)]
-        cv2.line(joined, start, end, colour, 1, cv2.LINE_AA)
-        for place in (start, end):
-            cv2.circle(joined, place, 2, colour, 1, cv2.LINE_AA)
+    left, right = _narrow(first, _WIDTH_PX), _narrow(second, _WIDTH_PX)
+    joined = np.ascontiguousarray(np.vstack([left, right]) if wide else np.hstack([left, right]))
+    starts = from_ * (_WIDTH_PX / first.shape[1])
+    ends = to * (_WIDTH_PX / second.shape[1]) + ([0, left.shape[0]] if wide else [_WIDTH_PX, 0])
+    for k, line in enumerate(np.rint(np.stack([starts, ends], axis=1)).astype(int).tolist()):
+        cv2.line(joined, line[0], line[1], _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
+        for place in line:
+            cv2.circle(joined, place, 2, _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
     return joined
 
 
@@ -114,7 +111,5 @@ def _narrow(image: Image, width: int) -> Image:
 
 
 def _picture(image: Image, title: str) -> Picture:
-    written, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    if not written:
-        return Picture(title, title, reason="it cannot be written as JPEG")
+    _, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
     return Picture.of_file(title, title, content.tobytes(), "jpeg")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics
-from slam.frontend.drive import Keyframe
 from slam.pipeline.estimate import Estimate
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.imports import import_extra
@@ -35,47 +34,37 @@ def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
         SlamError: rerun is not installed, or the file cannot be written.
     """
     (rr,) = import_extra("rerun")
+    keyframes = {keyframe.index: keyframe for keyframe in result.drive.keyframes}
 
     def fill(partial: Path) -> None:
         stream = rr.RecordingStream("erfsfm-slam")
         stream.save(str(partial))
         stream.log("world", rr.ViewCoordinates.RDF, static=True)
-        for name in _COLOURS:
+        for name, colour in _COLOURS.items():
             trajectory: Trajectory | None = getattr(result, name)
             if trajectory is not None:
-                strip = rr.LineStrips3D([trajectory.positions], colors=[_COLOURS[name]])
+                strip = rr.LineStrips3D([trajectory.positions], colors=[colour])
                 stream.log(f"world/{name}", strip, static=True)
-        keyframes = {keyframe.index: keyframe for keyframe in result.drive.keyframes}
         for index, T_world_camera in enumerate(result.optimised.T_world_camera):
             stream.set_time("frame", sequence=index)
             stream.set_time("time", duration=float(result.optimised.stamps[index]))
             pose = rr.Transform3D(translation=T_world_camera[:3, 3], mat3x3=T_world_camera[:3, :3])
             stream.log("world/camera", pose)
             if index in keyframes:
-                _log_images(rr, stream, keyframes[index], intrinsics, float(result.scale.per_frame[index]))
-        _log_map(rr, stream, result)
+                depth = np.nan_to_num(keyframes[index].depth_unscaled * np.float32(result.scale.per_frame[index]))
+                height, width = depth.shape
+                K = intrinsics.resized(width, height).K
+                stream.log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
+                image = rr.Image(keyframes[index].image).compress(jpeg_quality=_JPEG_QUALITY)
+                stream.log("world/camera/image", image)
+                stream.log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
+        if result.map is not None:
+            with suppress(EmptyMapError):  # which the run has reported
+                cloud = result.map.cloud()
+                radii = _POINT_VOXELS * result.map.voxel_size
+                points = rr.Points3D(cloud.points, colors=cloud.colours, radii=radii)
+                stream.log("world/map", points, static=True)
         stream.flush()
         stream.disconnect()
 
     write_atomically(path, fill)
-
-
-def _log_images(rr: Any, stream: Any, keyframe: Keyframe, intrinsics: Intrinsics, scale: float) -> None:
-    height, width = keyframe.depth_unscaled.shape
-    K = intrinsics.resized(width, height).K
-    stream.log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
-    stream.log("world/camera/image", rr.Image(keyframe.image).compress(jpeg_quality=_JPEG_QUALITY))
-    stream.log(
-        "world/camera/image/depth", rr.DepthImage(np.nan_to_num(keyframe.depth_unscaled * np.float32(scale)), meter=1.0)
-    )
-
-
-def _log_map(rr: Any, stream: Any, result: Estimate) -> None:
-    if result.map is None:
-        return
-    try:
-        cloud = result.map.cloud()
-    except EmptyMapError:  # an empty map, which the run has reported
-        return
-    points = rr.Points3D(cloud.points, colors=cloud.colours, radii=_POINT_VOXELS * result.map.voxel_size)
-    stream.log("world/map", points, static=True)

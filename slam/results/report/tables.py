@@ -1,306 +1,249 @@
-"""The tables of a report, from ``metrics.json``; every missing number shows its reason."""
+"""The tables of a report, from ``metrics.json``; rows that say nothing are left out."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import quote
 
-from slam.results.error_columns import (
-    ALIGNED_ATE,
-    COLUMNS,
-    DASH,
-    EVO_DIFFERENCE,
-    R_REL,
-    RPE_DEG,
-    RPE_M,
-    SNIPPET_ATE,
-    SNIPPET_RE,
-    T_REL,
-    ErrorColumn,
-    written,
-)
-from slam.results.metrics import CAMERA_HEIGHTS, METRES, GpsErrors, LoopsFile, Metrics, Stretch
-from slam.runtime.run_files import LOOPS, METRICS
-from slam.runtime.storage.record import NOT_RECORDED, Missing, known
+from markupsafe import Markup
 
+from erfsfm.common.table import DASH, Table
+from slam.evaluation.map import SurfaceMetrics
+from slam.results.folder import RunFolder
+from slam.results.metrics import CAMERA_HEIGHTS, METRES, GpsErrors, Metrics, Stretch
+from slam.results.tables import written
+from slam.runtime.run_files import MEANINGS, REPORT
+from slam.runtime.storage.record import NOT_RECORDED
 
-@dataclass(frozen=True)
-class Cell:
-    """A table cell: its text or a bar of ``bar`` percent, a tooltip, a style (``best``, ``missing``) and a link."""
-
-    text: str
-    tooltip: str = ""
-    style: str = ""
-    bar: float | None = None
-    address: str = ""
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells row by row; a row that is a string heads the rows below it. Notes stand under the table."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[Cell] | str]
-    style: str = ""
-    notes: Sequence[str] = field(default_factory=tuple)
-
-
-MOST_LOOPS = 40
-_ALIGNMENTS = {"dof6": "6dof", "dof7": "7dof"}
-_PER_ALIGNMENT = (
-    ("ate_rmse_m", "ATE RMSE, m", 3),
-    ("t_rel_percent", "t_rel, %", 2),
-    ("r_rel_deg_per_100m", "r_rel, deg / 100 m", 3),
-    ("rpe_trans_m", "RPE, m", 4),
-    ("rpe_rot_deg", "RPE, deg", 4),
-    ("scale", "scale", 4),
-)
+_MOST = 12  # of one kind
+_LEAST_SHARE = 0.0005  # that a table of percent shows
+_MAP_ERRORS = {
+    "accuracy\nmedian, m": "accuracy_median_m",
+    "accuracy\n90 %, m": "accuracy_90_m",
+    "over 1 m": "outlier_share",
+    "completeness\n0.3 m": "completeness",
+    "F-score\n0.2 m": "f_score.m02",
+    "F-score\n0.5 m": "f_score.m05",
+}
+_FILTERS = {
+    "unknown": "no depth",
+    "border": "left, right and upper border of the image (mapping.border)",
+    "bonnet": "lower border, the car's own hood (mapping.hood_crop)",
+    "sky": "bright or blue above the horizon (mapping.sky_brightness, mapping.sky_blueness)",
+    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m, mapping.certain_range_factor)",
+    "sigma": "refined depth too uncertain (mapping.max_relative_sigma)",
+    "edge": "at a step of depth (mapping.max_depth_step)",
+    "agreement": "the keyframe before does not agree (mapping.max_depth_difference)",
+    "moving": "a keyframe before saw what is behind",
+}
+_TRUTHS = {
+    "exact surface": "the exact surface of the simulated world",
+    "depth maps": "depth maps accumulated at true poses",
+    "lidar": "LiDAR scans accumulated at true poses, moving objects among them",
+}
 
 
-def number(value: Any, decimals: int = 0) -> Cell:
-    """A value of the metrics as a cell; a dash with its reason as a tooltip where it is missing."""
-    if isinstance(value, Missing):
-        return Cell(DASH, value.reason, "missing")
-    return Cell(f"{value:,}" if isinstance(value, int) else written(value, decimals))
+def number(value: Any, decimals: int = 0) -> str:
+    """A value of the metrics, a dash where it is missing."""
+    return f"{value:,}" if isinstance(value, int) else written(value, decimals)
 
 
-def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
-    """The key numbers that there are: name, value and unit of each."""
-    best = metrics.trajectories.optimised
-    fitted = ("dof6", "m, 6 dof") if metrics.is_metric else ("dof7", "m, 7 dof")
+def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
+    """The key numbers that there are: name, value and unit of each; of the map where it is one."""
+    best = metrics.trajectories.optimised.align
+    error = (best.dof6, "m, 6 dof") if metrics.is_metric else (best.dof7, "m, 7 dof")
     wanted = [
-        ("Position error", number(getattr(best.align, fitted[0]).ate_rmse_m, 2), fitted[1]),
-        ("Drift, t_rel", number(T_REL.value(best), 2), "%"),
-        ("Path", number(metrics.sequence.length_m), "m"),
-        ("Frames", number(metrics.sequence.frames), ""),
-        ("Speed", number(metrics.timing.frames_per_second, 1), "frames/s"),
-        ("Loops accepted", number(metrics.loops.accepted), ""),
-        ("Map triangles", number(metrics.map.triangles), ""),
+        ("Position error", error[0].ate_rmse_m, 2, error[1]),
+        ("Drift, t_rel", best.dof7.t_rel_percent, 2, "%"),
+        ("Path", metrics.sequence.length_m, 0, "m"),
+        ("Frames", metrics.sequence.frames, 0, ""),
+        ("Speed", metrics.timing.frames_per_second, 1, "frames/s"),
+        ("Loops accepted", metrics.loops.accepted, 0, ""),
+        ("Map triangles", metrics.map.triangles if has_map else None, 0, ""),
     ]
-    return [(name, cell, unit) for name, cell, unit in wanted if cell.style != "missing"]
+    return [(name, number(value, decimals), unit) for name, value, decimals, unit in wanted if value is not None]
 
 
 def what_ran(metrics: Metrics) -> Table:
     """Sequence, weights, scale and command; a run that failed early has fewer rows."""
 
-    def text(value: Any, decimals: int = 1, unit: str = "", most: int | None = None) -> str:
-        missing = f"{DASH} ({value.reason})" if isinstance(value, Missing) else ""
-        return missing or f"{written(value, decimals)[:most]}{unit}"
+    def text(path: str, decimals: int = 1, unit: str = "", most: int | None = None) -> str:
+        value, reason = metrics.at(path)
+        return f"{DASH} ({reason})" if value is None else f"{written(value, decimals)[:most]}{unit}"
 
     sequence, ran = metrics.sequence, metrics.provenance
+    leak = {True: "yes: trained on this sequence", False: "none known", None: DASH}[ran.leak]
+    rate = text("sequence.fps", unit=" a second")
     rows = [
-        ("Sequence", f"{text(sequence.name)}, {text(sequence.frames)} frames"),
-        ("Interpolated frames", _stretches(sequence.bridged) or "none"),
-        *([("Doubled frames", doubled)] if (doubled := _stretches(sequence.doubled)) else []),
-        *([("LiDAR scans left out", left_out)] if (left_out := _stretches(sequence.unreadable_scans)) else []),
-        ("True length", text(sequence.length_m, unit=" m")),
-        ("Frame rate", text(sequence.fps, unit=" frames/s")),
+        ("Sequence", f"{text('sequence.name')}, {text('sequence.frames')} frames, {rate}"),
+        ("Interpolated frames", "; ".join(by_reason(sequence.bridged or ()))),
+        ("Doubled frames", "; ".join(by_reason(sequence.doubled or ()))),
+        ("LiDAR scans left out", "; ".join(by_reason(sequence.unreadable_scans or ()))),
         ("Scale", _scale(metrics)),
-        ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
-        ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
+        ("Weights", f"{text('provenance.weights')}, sha256 {text('provenance.weights_sha256', most=16)}"),
         ("Depth", _depth_source(metrics)),
-        ("Licence of the weights", text(ran.weights_licence)),
-        ("Trained on", _shortened(list(ran.trained_on)) or DASH),
-        ("Leak", {True: "yes: trained on this sequence", False: "none known", None: DASH}[known(ran.leak)]),
-        ("Command", text(ran.command)),
-        ("Seed, device", f"{text(ran.seed)}, {text(ran.device)}"),
-        ("Version, commit", f"{text(ran.version)}, {text(ran.commit)}"),
+        ("Licence of the weights", text("provenance.weights_licence")),
+        ("Trained on", _shortened(ran.trained_on or ()) or DASH),
+        ("Leak", leak),
+        ("Command", text("provenance.command")),
+        ("Seed, device", f"{text('provenance.seed')}, {text('provenance.device')}"),
+        ("Version, commit", f"{text('provenance.version')}, {text('provenance.commit')}"),
     ]
-    recorded = [row for row in rows if NOT_RECORDED not in row[1]] if metrics.failure else rows
-    return Table((), _texts(recorded), "words")
+    told = [row for row in rows if row[1] and not (metrics.failure and NOT_RECORDED in row[1])]
+    return Table((), told, names=2)
 
 
-def _scale(metrics: Metrics) -> str:
-    scale = metrics.scale
-    if isinstance(scale.value, Missing):
-        return f"mode {known(scale.mode) or DASH}, {scale.value.reason}"
-    spread, frames = known(scale.spread), known(scale.frames_used)
-    unit = metrics.unit if metrics.unit in (METRES, CAMERA_HEIGHTS) else "units of the result"
-    certain = "" if spread is None else f", spread {100 * spread:.1f} %"
-    used = "" if frames is None else f", measured in {frames} frames"
-    return f"mode {known(scale.mode)}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
+def by_reason(found: Iterable[Stretch]) -> list[str]:
+    """For each reason the frames that it is about, such as ``frames 3, 7 to 9: reason``."""
+    frames: dict[str, list[str]] = {}
+    for each in found:
+        ends = str(each.first) if each.first == each.last else f"{each.first} to {each.last}"
+        frames.setdefault(each.reason, []).append(ends)
+    return [f"frames {_shortened(ends)}: {reason}" for reason, ends in frames.items()]
 
 
 def gps(metrics: Metrics) -> Table | None:
     """Distances from the GPS track; None without one."""
     found = metrics.gps
-    if isinstance(found, Missing):
+    if found.absent:
         return None
 
-    def row(name: str, errors: GpsErrors | Missing) -> list[Cell]:
+    def row(name: str, errors: GpsErrors) -> list[str]:
         values = (errors.horizontal_rmse_m, errors.horizontal_median_m, errors.vertical_rmse_m)
-        return [Cell(name), *(number(value, 2) for value in values)]
+        return [name, *(number(value, 2) for value in values)]
 
-    factors = "factors of the pose graph: the optimised row is no independent test"
+    factors = "which are factors of the pose graph: the optimised row is no independent test"
     use = factors if found.in_graph is True else "not in the pose graph"
-    notes = [f"{known(found.fixes)} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
-    head = ("", "horizontal RMSE, m", "horizontal median, m", "vertical RMSE, m")
+    notes = [f"{found.fixes} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
+    head = ("", "horizontal\nRMSE, m", "horizontal\nmedian, m", "vertical\nRMSE, m")
     return Table(head, [row("odometry", found.odometry), row("optimised", found.optimised)], notes=notes)
 
 
-def no_errors(metrics: Metrics) -> str:
-    """Why no trajectory has an error; empty where one has, or where nothing was evaluated."""
-    values = [column.value(errors) for column in COLUMNS for errors in metrics.evaluated_errors().values()]
-    missing = [value.reason for value in values if isinstance(value, Missing)]
-    return missing[0] if values and len(missing) == len(values) else ""
-
-
-def errors(metrics: Metrics) -> Table | None:
-    """Every trajectory against the truth, a column each; None where nothing was evaluated."""
-    evaluated = metrics.evaluated_errors()
-    if not evaluated or no_errors(metrics):
-        return None
-
-    def row(column: ErrorColumn) -> list[Cell]:
-        values = [column.value(each) for each in evaluated.values()]
-        numbers = {value for value in values if not isinstance(value, Missing)}
-        least = min(numbers) if column is not EVO_DIFFERENCE and len(numbers) > 1 else None
-        cells = [number(value, column.decimals) for value in values]
-        styles = ["best" if value == least else cell.style for value, cell in zip(values, cells)]
-        texts = [column.text(each) for each in evaluated.values()]
-        return [
-            Cell(column.name),
-            *(Cell(text, cell.tooltip, style) for text, cell, style in zip(texts, cells, styles)),
-        ]
-
-    rows: list[Sequence[Cell] | str] = [
-        "Snippets of five frames, each with its own scale; ATE is norm / 5",
-        *(row(column) for column in (SNIPPET_ATE, SNIPPET_RE)),
-        "Whole trajectory: position error in metres, by alignment",
-        *(row(column) for column in ALIGNED_ATE),
-        "KITTI segments of 100 to 800 m",
-        *(row(column) for column in (T_REL, R_REL)),
-        "From frame to frame",
-        *(row(column) for column in (RPE_M, RPE_DEG)),
-        "Cross-check",
-        row(EVO_DIFFERENCE),
-    ]
-    notes = ["Bold: the best of a row.", *notes_on(_missing_errors(metrics))]
-    return Table(["", *evaluated], rows, notes=notes)
-
-
-def alignments(metrics: Metrics) -> Table | None:
-    """Every statistic of every trajectory under every alignment; None where nothing was evaluated."""
-    if no_errors(metrics):
-        return None
-    rows: list[Sequence[Cell] | str] = []
-    for name, found in metrics.evaluated_errors().items():
-        if isinstance(found.align, Missing):
-            continue
-        rows.append(name)
-        for how, each in found.align:
-            cells = [number(getattr(each, key), decimals) for key, _, decimals in _PER_ALIGNMENT]
-            rows.append([Cell(_ALIGNMENTS.get(how, how)), *cells])
-    return Table(["alignment", *(label for _, label, _ in _PER_ALIGNMENT)], rows) if rows else None
-
-
-def loops(metrics: Metrics, details: LoopsFile) -> dict[str, Any] | None:
-    """``counts`` of loops, ``reasons`` of those that are missing, and a ``table`` of the accepted and the rejected."""
+def loop_counts(metrics: Metrics) -> str:
+    """How far loops came, in one sentence; empty where nothing is known of them."""
     found = metrics.loops
-    if isinstance(found, Missing):
-        return None
-    stages = {"candidates": found.candidates, "verified": found.verified, "accepted": found.accepted}
-    groups = (("accepted", details.accepted), ("rejected", found.rejected))
-    rows = [(str(loop.from_), str(loop.to), verdict, loop.reason) for verdict, group in groups for loop in group]
-    left_out = known(details.rejected_left_out)
-    where = LOOPS + (f", without {left_out} rejected ones of fewest inliers" if left_out else "")
-    return {
-        "counts": ", ".join(f"{number(value).text} {stage}" for stage, value in stages.items()),
-        "reasons": notes_on(number(value).tooltip for value in stages.values()),
-        "table": _first_of(("from frame", "to frame", "verdict", "reason"), rows, where),
-    }
+    if found.absent:
+        return ""
+    stages = {"candidates": "candidates", "verified": "measured", "accepted": "accepted"}
+    reasons = {reason: None for value, reason in map(found.at, stages) if value is None}
+    counts = ", ".join(f"{number(found.at(name)[0])} {word}" for name, word in stages.items())
+    return f"{counts}{''.join(f'; {reason}' for reason in reasons)}. All are in loops.json."
 
 
-def tracking(metrics: Metrics) -> dict[str, Any] | None:
-    """``counts`` of keyframes and maps, and a ``table`` of what became of them; None without keyframes."""
-    found = metrics.tracking
-    if isinstance(found, Missing):
-        return None
+def depth_error(metrics: Metrics) -> Table | None:
+    """Error of learned depth over distance; None where it was not measured."""
     rows = [
-        ["" if value is None else str(value) for value in (event.frame, event.event, event.other, event.support)]
-        for event in found.events
+        [
+            number(row.depth, 1),
+            DASH if row.bias is None else f"{100 * row.bias:+.0f} %",
+            DASH if row.sigma is None else f"{100 * row.sigma:.0f} %",
+            number(row.corners),
+        ]
+        for row in metrics.depth_error or ()
     ]
-    return {
-        "counts": f"{number(found.keyframes).text} keyframes, {number(found.maps).text} maps",
-        "table": _first_of(("frame", "event", "at the place of frame", "points or loops"), rows, METRICS),
-    }
+    note = (
+        "Learned depth against depth triangulated from the images. Its mean error (bias) is taken out before it is "
+        "compared with image geometry."
+    )
+    return Table(("learned depth", "bias", "spread", "corners"), rows, notes=[note]) if rows else None
 
 
-def graph(metrics: Metrics) -> dict[str, Any] | None:
-    """``nodes`` and ``factors`` of the pose graph, and the ``reasons`` why its noise is not covered."""
-    found = metrics.graph
-    if isinstance(found, Missing):
+def map_left_out(metrics: Metrics) -> Table | None:
+    """The share of pixels that each filter took before fusion, and what cleaning the mesh took; None without a map."""
+    filters = metrics.map.filters
+    if filters is None:
         return None
-    reasons = notes_on([f"coverage: {found.coverage.reason}"]) if isinstance(found.coverage, Missing) else []
-    return {"nodes": number(found.nodes).text, "factors": number(found.factors).text, "reasons": reasons}
+    shares = {name: (share, _FILTERS.get(name, "")) for name, share in filters.items()}
+    shares["fused"] = (1.0 - sum(filters.values()), "what the filters left")
+    loose = "of the mesh: small loose pieces, left out (mapping.min_component_triangles)"
+    double = "of the mesh's area: a parallel surface 0.3 to 2 m before it"
+    for name, part, what in (
+        ("floaters", metrics.map.floater_share, loose),
+        ("double walls", metrics.map.double_wall_share, double),
+    ):
+        shares[name] = (part or 0.0, what)
+    rows = [[name, f"{share:.1%}", what] for name, (share, what) in shares.items() if share >= _LEAST_SHARE]
+    side = f"{number(metrics.map.voxel_size, 2)} {'m' if metrics.is_metric else 'units'}"
+    note = f"{number(metrics.map.frames_fused)} keyframes, voxels of {side}."
+    return Table(("", "share", "of the keyframes' pixels, one filter after another"), rows, notes=[note], names=3)
+
+
+def map_errors(metrics: Metrics) -> Table | None:
+    """Errors of the map under both alignments, and by distance from the camera; None without a map."""
+    found = metrics.map
+    if found.triangles is None:
+        return None
+    if found.truth is None:
+        return Table((), (), notes=[f"No error of the map: {found.why('truth')}."])
+    rows: dict[str, SurfaceMetrics] = {"one rigid motion": found} if metrics.is_metric else {}
+    if found.in_field.share not in (None, 1.0):
+        rows["where the scanner looked"] = found.in_field
+    rows["with one scale"] = found.with_scale
+    rings = found.with_scale.by_distance if found.by_distance is None else found.by_distance
+    rows |= {f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera": ring for ring in rings or ()}
+    texts = [[name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())] for name, each in rows.items()]
+    truth, length = _TRUTHS.get(found.truth, found.truth), number(found.evaluated_m)
+    note = f"Against {truth}, {length} m of the path. Map where no surface was measured is an error."
+    return Table(("", *_MAP_ERRORS), texts, notes=[note])
 
 
 def timing(metrics: Metrics) -> Table | None:
     """Seconds by stage, the longest first; None where nothing was timed."""
-    stages = known(metrics.timing.stages)
+    stages = metrics.timing.stages
     if not stages:
         return None
     timed = sum(stages.values())
-    total = max(known(metrics.timing.seconds_total) or 0.0, timed, 1e-9)
-    stages = stages | {"between stages": total - timed}
-    longest = max(*stages.values(), 1e-9)
+    total = max(metrics.timing.seconds_total or 0.0, timed, 1e-9)
+    ordered = sorted((stages | {"between stages": total - timed}).items(), key=lambda item: -item[1])
+    rows = [[name, f"{seconds:.1f}", f"{seconds / total:.0%}"] for name, seconds in ordered if seconds >= 0.005 * total]
+    memory, processor = (number(each) for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds))
+    note = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."
+    return Table(("stage", "seconds", "share"), rows, notes=[note])
+
+
+def files(folder: RunFolder) -> Table | None:
+    """Every other file of the run with its meaning and size."""
     rows = [
-        [Cell(name), Cell(f"{seconds:.1f} s"), Cell(f"{100 * seconds / total:.0f} %"), _bar(seconds / longest)]
-        for name, seconds in sorted(stages.items(), key=lambda item: -item[1])
+        [
+            Markup('<a href="{}"><code>{}</code></a>').format(quote(path.name), path.name),
+            MEANINGS.get(path.name, ""),
+            _size(path.stat().st_size),
+        ]
+        for path in sorted(folder.path.iterdir())
+        if path.is_file() and not path.name.startswith(".") and path.name != REPORT
     ]
-    memory, processor = (number(each).text for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds))
-    words = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."
-    return Table(("stage", "time", "share", ""), rows, notes=[words])
+    return Table((), rows, names=2) if rows else None
 
 
-def _missing_errors(metrics: Metrics) -> list[str]:
-    """What of the errors is missing, by reason."""
-    missing: dict[str, list[str]] = {}
-    for column in COLUMNS:
-        for name, errors in metrics.evaluated_errors().items():
-            value = column.value(errors)
-            if isinstance(value, Missing):
-                missing.setdefault(value.reason, []).append(f"{column.name} of {name}")
-    for name, errors in metrics.all_errors().items():
-        if isinstance(errors, Missing):
-            missing.setdefault(errors.reason, []).append(f"{name} trajectory")
-    return [f"{', '.join(what) if len(what) <= 4 else 'others'}: {why}" for why, what in missing.items()]
-
-
-def _texts(rows: Iterable[Sequence[str]]) -> list[list[Cell]]:
-    return [[Cell(text) for text in row] for row in rows]
-
-
-def _first_of(head: Sequence[str], rows: Sequence[Sequence[str]], where: str) -> Table | None:
-    """The first rows, with a note on the file ``where`` all of them are; None without any."""
-    more = [f"{len(rows) - MOST_LOOPS} more in {where}."] if len(rows) > MOST_LOOPS else []
-    return Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None
-
-
-def _bar(ratio: float) -> Cell:
-    return Cell("", style="track", bar=100.0 * min(max(ratio, 0.0), 1.0))
-
-
-def notes_on(reasons: Iterable[str]) -> list[str]:
-    """One line with the reasons of missing numbers, each once; none where nothing is missing."""
-    distinct = [reason for reason in dict.fromkeys(reasons) if reason]
-    return [f"{DASH}  {'; '.join(distinct)}."] if distinct else []
+def _scale(metrics: Metrics) -> str:
+    scale = metrics.scale
+    if scale.value is None:
+        return f"mode {scale.mode or DASH}, {scale.why('value')}"
+    spread, frames = scale.spread, scale.frames_used
+    unit = metrics.unit if metrics.unit in (METRES, CAMERA_HEIGHTS) else "units of the result"
+    certain = "" if spread is None else f", spread {100 * spread:.1f} %"
+    used = "" if frames is None else f", measured in {frames} frames"
+    return f"mode {scale.mode}: one unit of the networks is {scale.value:.4g} {unit}{certain}{used}"
 
 
 def _depth_source(metrics: Metrics) -> str:
     name = metrics.provenance.depth_source
-    if isinstance(name, Missing):
-        return f"{DASH} ({name.reason})"
-    sha256 = known(metrics.provenance.depth_sha256)
+    if name is None:
+        return f"{DASH} ({metrics.provenance.why('depth_source')})"
+    sha256 = metrics.provenance.depth_sha256
     return "by these weights" if name == "network" else f"{name}, sha256 {str(sha256)[:16]}"
 
 
-def _stretches(found: list[Stretch] | Missing) -> str:
-    """Consecutive frames, with the reason of the first."""
-    return _shortened([f"{each.first} to {each.last}: {each.reason}" for each in found])
+def _shortened(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST} more" if len(names) > _MOST else ""
+    return ", ".join(names[:_MOST]) + more
 
 
-def _shortened(names: Sequence[str], most: int = 12) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+def _size(count: int) -> str:
+    size = float(count)
+    for unit in ("B", "kB", "MB"):
+        if size < 1000.0:
+            return f"{size:.3g} {unit}"
+        size /= 1000.0
+    return f"{size:.3g} GB"

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from slam.frontend.agreement import DOUBTFUL
 from slam.results.metrics import CAMERA_HEIGHTS, METRES, Metrics
-from slam.runtime.storage.record import Missing, known
 
 _FROM = {
     "camera-height": "the camera's height over the road",
@@ -25,11 +24,12 @@ _LEAST_FUSED = 0.15  # of the depth of all keyframes: maps of streets and rooms 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A sentence, signs that speak for the run, and doubts."""
+    """A sentence, signs that speak for the run, doubts, and why its map is no more than ``scraps``."""
 
     sentence: str
     signs: Sequence[str]
     doubts: Sequence[str]
+    scraps: str = ""
 
 
 def verdict(metrics: Metrics) -> Verdict | None:
@@ -37,11 +37,14 @@ def verdict(metrics: Metrics) -> Verdict | None:
     if metrics.failure:
         return None
     found: tuple[list[str], list[str]] = [], []
+    scraps = _scraps(metrics)
     for part in (_confidence, _loops, _agreement, _unit, _noise, _frames, _map):
         for is_sign, words in part(metrics):
             found[0 if is_sign else 1].append(words)
+    if scraps:
+        found[1].append(scraps)
     confirmed = next((words for is_sign, words in _loops(metrics) if is_sign), "")
-    return Verdict(_sentence(metrics, confirmed), *found)
+    return Verdict(_sentence(metrics, confirmed), *found, scraps)
 
 
 def percent(share: float) -> str:
@@ -50,11 +53,11 @@ def percent(share: float) -> str:
 
 
 def _sentence(metrics: Metrics, confirmed: str) -> str:
-    align, length = metrics.trajectories.optimised.align, known(metrics.sequence.length_m)
-    error = known((align.dof6 if metrics.is_metric else align.dof7).ate_rmse_m)
+    align, length = metrics.trajectories.optimised.align, metrics.sequence.length_m
+    error = (align.dof6 if metrics.is_metric else align.dof7).ate_rmse_m
     if error is None:
         means = "its lengths are in metres" if metrics.is_metric else _no(metrics.unit)
-        sure = known(metrics.confidence.run)
+        sure = metrics.confidence.run
         likely = f": {percent(sure)} of drives like it err by at most 1 % of their path" if sure is not None else ""
         return f"Without a truth its error is unknown{likely}{f', and {confirmed}' if confirmed else ''}; {means}."
     part = f", {percent(error / length)} of its {length:.3g} m" if length else ""
@@ -69,44 +72,44 @@ def _no(unit: str) -> str:
 
 
 def _unit(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    scale, spread = metrics.scale, known(metrics.scale.spread)
-    if metrics.unit == METRES and (source := _FROM.get(known(scale.mode) or "")):
+    scale, spread = metrics.scale, metrics.scale.spread
+    if metrics.unit == METRES and (source := _FROM.get(scale.mode or "")):
         certain = f" (spread {percent(spread)})" if spread is not None else ""
         yield scale.mode != "reference" and (spread or 0.0) < _WIDE_SPREAD, f"metres come from {source}{certain}"
-    fitted = known(metrics.trajectories.optimised.align.dof7.scale)
+    fitted = metrics.trajectories.optimised.align.dof7.scale
     if metrics.is_metric and fitted and abs(fitted - 1.0) > _LARGEST_SCALE_ERROR:
         yield False, f"lengths are {percent(abs(1.0 / fitted - 1.0))} too {'short' if fitted > 1.0 else 'long'}"
 
 
 def _loops(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    accepted, candidates = known(metrics.loops.accepted), known(metrics.loops.candidates)
+    accepted, candidates = metrics.loops.accepted, metrics.loops.candidates
     if accepted:
         yield (
             True,
-            f"{accepted} of {_count(known(metrics.loops.verified) or accepted, 'measured loop')} agree and close it",
+            f"{accepted} of {_count(metrics.loops.verified or accepted, 'measured loop')} agree and close it",
         )
     elif accepted == 0:
         yield False, f"no loop closes it ({candidates} candidates), so drift adds up"
-    elif isinstance(metrics.loops.accepted, Missing):
-        yield False, f"drift adds up: {metrics.loops.accepted.reason}"
+    else:
+        yield False, f"drift adds up: {metrics.loops.why('accepted')}"
 
 
 def _confidence(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    sure = known(metrics.confidence.run)
+    sure = metrics.confidence.run
     if sure is not None:
         yield sure > _SURE, f"{percent(sure)} of drives with images like its own err by at most 1 % of their path"
-    elif isinstance(metrics.confidence.run, Missing) and not isinstance(metrics.confidence, Missing):
-        yield False, f"nobody knows how sure it is: {metrics.confidence.run.reason}"
+    elif not metrics.confidence.absent:
+        yield False, f"its confidence is not known: {metrics.confidence.why('run')}"
 
 
 def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    for each in known(metrics.agreement) or ():
-        sigmas = known(each.sigmas) or 0.0
-        if sigmas <= DOUBTFUL and each.beside != "the images":
-            continue  # `_confidence` says it of all
-        verb = "agrees with" if sigmas <= DOUBTFUL else "contradicts"
-        yield sigmas <= DOUBTFUL, f"{each.source} {verb} {each.beside} ({sigmas:.1f} sigmas: {known(each.figure)})"
-    off = known(metrics.gps.optimised.horizontal_rmse_m)
+    for each in metrics.agreement or ():
+        agrees = (each.sigmas or 0.0) <= DOUBTFUL
+        if each.beside == "the images":
+            yield agrees, f"{each.source} {'agrees with' if agrees else 'contradicts'} the images: {each.figure}"
+        elif not agrees:  # `_confidence` says of all whether the run is like good ones
+            yield False, f"{each.source}: {each.figure}"
+    off = metrics.gps.optimised.horizontal_rmse_m
     if off is not None:
         within = "" if metrics.gps.in_graph is True else ", which it did not use"
         yield True, f"it stays within {off:.2g} m (RMSE) of the GPS track{within}"
@@ -114,7 +117,7 @@ def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 
 def _noise(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     coverage = metrics.graph.coverage
-    inside = [known(each) for each in (coverage.inside_50, coverage.inside_90, coverage.inside_95)]
+    inside = (coverage.inside_50, coverage.inside_90, coverage.inside_95)
     shares = [each for each in inside if each is not None]
     if len(shares) == 3:
         off = [share - promised for share, promised in zip(shares, (0.5, 0.9, 0.95))]
@@ -127,23 +130,36 @@ def _noise(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 
 def _frames(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     sequence = metrics.sequence
-    if doubled := sum(each.last - each.first + 1 for each in known(sequence.doubled) or ()):
+    if doubled := sum(each.last - each.first + 1 for each in sequence.doubled or ()):
         yield False, f"{_count(doubled, 'frame')} repeat the one before while the camera moves"
-    if (maps := known(metrics.tracking.maps) or 1) > 1:
-        yield False, f"tracking was lost: {maps} maps are not joined"
+    if (maps := metrics.tracking.maps or 1) > 1:
+        lost = ", ".join(
+            str(event.frame) for event in metrics.tracking.events or () if event.frame and "begun" in event.event
+        )
+        yield False, f"tracking was lost{f' at frames {lost}' if lost else ''}: {maps} maps are not joined"
     if metrics.provenance.leak is True:
         yield False, "LEAK: its weights saw this sequence, or a part of it, in training"
 
 
 def _map(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    off = known(metrics.map.accuracy_median_m)
+    off = metrics.map.accuracy_median_m
     if off is not None:
         yield True, f"its map lies {off:.2g} m (median) from the true surface"
-    frames, filters = known(metrics.map.frames_fused), known(metrics.map.filters)
-    if frames and filters:
-        fused = (1.0 - sum(filters.values())) * frames / (frames + (known(metrics.map.frames_left_out) or 0))
-        if fused < _LEAST_FUSED:
-            yield False, f"{percent(1.0 - fused)} of the depth of its keyframes was thrown away before the map"
+
+
+def _scraps(metrics: Metrics) -> str:
+    """What is wrong with a map of which too little was fused; empty of a whole one, or without a map."""
+    frames, filters = metrics.map.frames_fused, metrics.map.filters
+    if not frames or not filters:
+        return ""
+    fused = (1.0 - sum(filters.values())) * frames / (frames + (metrics.map.frames_left_out or 0))
+    if fused >= _LEAST_FUSED:
+        return ""
+    most = max(filters, key=filters.__getitem__)
+    return (
+        f"its map is scraps: {percent(fused)} of the depth of its keyframes was good enough to fuse, 35 to 60 % is "
+        f"usual; most was left out by the filter {most} ({percent(filters[most])})"
+    )
 
 
 def _count(number: int, noun: str) -> str:

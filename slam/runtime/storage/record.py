@@ -1,96 +1,94 @@
-"""Records kept as JSON: every value is there, or the reason why it is missing; a damaged file is one clear error."""
+"""Records kept as JSON: what is not known is null beside the reason; a damaged file is one clear error."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Never, Self, TypeVar, Union, get_args
+from typing import Annotated, Any, Never, Self
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError, model_validator
-from pydantic_core import CoreSchema
-from pydantic_core.core_schema import no_info_wrap_validator_function
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from erfsfm.common.config_tree import first_problem
 from erfsfm.common.files import read_text
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import RunError
 
 NOT_RECORDED = "not recorded"
 _MAX_BYTES = 64 * 2**20
-_T = TypeVar("_T")
 
-
-@dataclass(frozen=True)
-class Missing:
-    """A value that is not known, and why; so are all its parts."""
-
-    reason: str = NOT_RECORDED
-
-    def __getattr__(self, name: str) -> Missing:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return self
-
-    def __iter__(self) -> Iterator[Never]:
-        return iter(())
-
-
-class _OrMissing:
-    """Validates a value as what it is beside `Missing`, so that errors name its key alone."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        kinds = tuple(kind for kind in get_args(source) if kind is not Missing)
-        schema = handler.generate_schema(Union[kinds])  # noqa: UP007 - of a tuple
-        return no_info_wrap_validator_function(lambda value, check: _checked(value, check), schema)
-
-
-def _checked(value: Any, check: Any) -> Any:
-    return value if isinstance(value, Missing) else check(value)
-
-
-Known = Annotated[_T | Missing, _OrMissing()]
 Count = Annotated[int, Field(ge=0)]
-MISSING = Missing()
-
-
-def known(value: _T | Missing) -> _T | None:
-    """The value; None where it is missing."""
-    return None if isinstance(value, Missing) else value
 
 
 class Record(BaseModel):
-    """Part of a JSON file. A missing value is null beside ``<name>_reason``; keys without a field are not read.
+    """Part of a JSON file. A value that is not known is None, in the file null beside ``<key>_reason``.
 
-    A number that is not finite is missing. JSON's own kinds are not converted.
+    A part that is missing as a whole has no value, and ``absent`` says why. A number that is not
+    finite is not known. JSON's own kinds are not converted; keys without a field are not read.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, populate_by_name=True, allow_inf_nan=False)
 
+    absent: str = ""
+    reasons: dict[str, str] = {}
+
     @model_validator(mode="before")
     @classmethod
     def _with_reasons(cls, content: Any) -> Any:
-        if isinstance(content, cls):
-            return content
+        if isinstance(content, Failed):
+            return {"absent": content.reason}
         if not isinstance(content, dict):
+            if isinstance(content, cls):
+                return content
             raise ValueError(f"should be an object with keys, is {str(content)[:40]!r}")
-        read = dict(content)
+        read, reasons = dict(content), dict(content.get("reasons", {}))
         for name, field in cls.model_fields.items():
             key = field.alias if field.alias in content else name
             value = content.get(key, 0)
-            if not any(isinstance(each, _OrMissing) for each in field.metadata):
-                continue
-            if value is None:
-                read[key] = Missing(str(content.get(f"{key}_reason") or NOT_RECORDED))
+            if value is None and f"{key}_reason" in content:
+                value = Failed(str(content[f"{key}_reason"]))
+            elif value is None and _is_part(field.annotation):
+                value = Failed(NOT_RECORDED)
             elif isinstance(value, float) and not math.isfinite(value):
-                read[key] = Missing(f"the computation gave {value}")
-        return read
+                value = Failed(f"the computation gave {value}")
+            if isinstance(value, Failed):
+                read[key] = value if _is_part(field.annotation) else None
+                reasons[name] = value.reason
+        return read | {"reasons": reasons}
 
     @classmethod
-    def missing(cls, reason: str) -> Self:
-        """All values missing for one reason."""
-        return cls(**dict.fromkeys(cls.model_fields, Missing(reason)))
+    def names(cls) -> list[str]:
+        """The names of all values."""
+        return [name for name in cls.model_fields if name not in Record.model_fields]
+
+    @classmethod
+    def of(cls, **values: Any) -> Self:
+        """With these values, each of which may be a `Failed`."""
+        return cls.model_validate(values)
+
+    @classmethod
+    def unknown(cls, reason: str, *names: str) -> Self:
+        """These values, or all, not known for one reason."""
+        return cls.of(**dict.fromkeys(names or cls.names(), Failed(reason)))
+
+    def why(self, name: str) -> str:
+        """Why a value is not known."""
+        return self.reasons.get(name) or self.absent or NOT_RECORDED
+
+    def at(self, path: str) -> tuple[Any, str]:
+        """The value at a dotted path of names or keys, and why it is not known."""
+        record, absent = self, self.absent
+        *parts, name = path.split(".")
+        for key in parts:
+            record = getattr(record, record._name(key))
+            absent = absent or record.absent
+        name = record._name(name)
+        return getattr(record, name), absent or record.why(name)
+
+    @classmethod
+    def _name(cls, key: str) -> str:
+        return next((name for name, field in cls.model_fields.items() if field.alias == key), key)
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -108,13 +106,10 @@ class Record(BaseModel):
             raise
         except PermissionError as error:
             raise RunError(f"{path} cannot be read: {error.strerror}: check its permissions") from error
-        except ValidationError as error:
-            raise RunError(f"{path} is damaged: {first_problem(error)}; run the sequence again") from error
-        except RecursionError as error:
-            raise RunError(f"{path} is damaged: nested without end; run the sequence again") from error
-        except (OSError, ValueError) as error:
-            reason = " ".join(str(getattr(error, "strerror", None) or error).split())
-            raise RunError(f"{path} is damaged: {reason}; run the sequence again") from error
+        except (OSError, ValueError, RecursionError) as error:
+            reason = first_problem(error) if isinstance(error, ValidationError) else getattr(error, "strerror", None)
+            text = " ".join(str(reason or error).split())
+            raise RunError(f"{path} is damaged: {text}; run the sequence again") from error
 
     def __getitem__(self, key: str) -> Any:
         """The value of a key as JSON has it, so that a record reads like the file."""
@@ -123,12 +118,14 @@ class Record(BaseModel):
     def tree(self) -> dict[str, Any]:
         """The given values as JSON has them, in the order of the fields, reasons beside the missing ones."""
         tree: dict[str, Any] = {}
-        for name, field in type(self).model_fields.items():
-            if name in self.model_fields_set:
-                key, value = field.alias or name, getattr(self, name)
-                tree[key] = _plain(value)
-                if isinstance(value, Missing):
-                    tree[f"{key}_reason"] = value.reason
+        for name in self.names():
+            if name not in self.model_fields_set:
+                continue
+            key, value = type(self).model_fields[name].alias or name, getattr(self, name)
+            absent = value.absent if isinstance(value, Record) else self.reasons.get(name, "")
+            tree[key] = None if absent else _plain(value)
+            if absent:
+                tree[f"{key}_reason"] = absent
         return tree
 
     def to_json(self) -> str:
@@ -136,9 +133,16 @@ class Record(BaseModel):
         return json.dumps(self.tree(), indent=2, allow_nan=False)
 
 
+def part(kind: type[Record], alias: str | None = None) -> Any:
+    """The field of a part of a record, missing by default."""
+    return Field(default_factory=partial(kind, absent=NOT_RECORDED), alias=alias)
+
+
+def _is_part(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Record)
+
+
 def _plain(value: Any) -> Any:
-    if isinstance(value, Missing):
-        return None
     if isinstance(value, Record):
         return value.tree()
     if isinstance(value, dict):

@@ -48,22 +48,15 @@ class SpillFile:
         """An array that was put at ``start``.
 
         Raises:
-            SlamError: the file cannot be read, or is shorter than what was put there.
+            SlamError: the file cannot be read, or was cut short.
         """
-        array = np.empty(shape, dtype)
+        count = int(np.prod(shape))
         try:
             with self._lock:
                 self._file.seek(start)
-                found = self._file.readinto(array.data)  # type: ignore[attr-defined]
-        except OSError as error:
-            reason = error.strerror or error
-            raise SlamError(f"{self._what} in {tempfile.gettempdir()} cannot be read ({reason})") from error
-        if found != array.nbytes:
-            raise SlamError(
-                f"{self._what} in {tempfile.gettempdir()} are cut short ({found} of {array.nbytes} bytes): "
-                "something shortened the temporary file; run again"
-            )
-        return array
+                return np.fromfile(self._file, dtype, count).reshape(shape)
+        except (OSError, ValueError) as error:
+            raise SlamError(f"{self._what} in {tempfile.gettempdir()} cannot be read ({error}): run again") from error
 
 
 @dataclass(frozen=True)

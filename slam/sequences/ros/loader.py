@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import Stretch, first_usual
 from slam.formats.rows import BadRows
 from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import own_camera
+from slam.sequences.camera_file import find_camera_file
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import poses_near
+from slam.sequences.poses import poses_near, poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source
 from slam.sequences.ros.bag import Bag, is_bag
 from slam.sequences.ros.messages import (
@@ -31,7 +32,6 @@ from slam.sequences.ros.messages import (
     COMPRESSED_IMAGE,
     IMAGE,
     POINT_CLOUD,
-    SIXTEEN_BITS,
     camera_file_of,
     image_of,
     is_rectified,
@@ -39,7 +39,6 @@ from slam.sequences.ros.messages import (
     shows_pictures,
     values_of,
 )
-from slam.sequences.ros.transforms import StaticTransforms, moving_frames, transform_of
 
 logger = logging.getLogger(__name__)
 
@@ -49,8 +48,9 @@ _POSES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
-_FIX = "sensor_msgs/msg/NavSatFix"
-_TRUTH = re.compile(r"ground_?truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack", re.IGNORECASE)
+_POSITIONS = ("sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped")
+_TRUTH = re.compile(r"truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack|qualisys|natnet", re.IGNORECASE)
+_STATIC_TOPIC, _MOVING_TOPIC = "/tf_static", "/tf"
 _CACHED_FRAMES = 32
 _MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
@@ -155,15 +155,80 @@ class BagImages:
         return image_of(self.messages.read(index), self._where, self._stretch)
 
     def _common_stretch(self) -> Stretch | None:
-        """By some images; None where they have eight bits, or are compressed."""
+        """By some images; None where they have eight bits."""
         seen: list[NDArray[np.uint16]] = []
         for index in range(0, len(self), max(len(self) // _STRETCHED_BY, 1)):
-            message = self.messages.read(index)
-            if getattr(message, "encoding", "") not in SIXTEEN_BITS:
-                return None
-            with suppress(SequenceError):
-                seen.append(values_of(message, self._where))
+            with suppress(SequenceError, DataError):
+                seen.append(values_of(self.messages.read(index), self._where))
+                if seen[-1].dtype != np.uint16:
+                    return None
         return Stretch.of(seen) if seen else None
+
+
+class StaticTransforms:
+    """The tree of the frames of ``/tf_static``."""
+
+    def __init__(self, bag: Bag) -> None:
+        """Read all static transforms, without bad ones; the last of a frame counts."""
+        self._parents: dict[str, tuple[str, FloatArray]] = {}
+        for message in bag.messages(_STATIC_TOPIC) if _STATIC_TOPIC in bag.types else ():
+            for each in message.transforms:
+                try:
+                    mount = frame_name(each.header.frame_id), transform_of(each.transform)
+                except ValueError as error:
+                    logger.warning("%s: the transform of %r is left out: %s", _STATIC_TOPIC, each.child_frame_id, error)
+                    continue
+                self._parents[frame_name(each.child_frame_id)] = mount
+
+    def between(self, a: str, b: str) -> FloatArray | None:
+        """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
+        if not (frame_name(a) and frame_name(b)):
+            return None
+        (root_a, T_root_a), (root_b, T_root_b) = (self._from_root(frame_name(frame)) for frame in (a, b))
+        return invert(T_root_a) @ T_root_b if root_a == root_b else None
+
+    def _from_root(self, frame: str) -> tuple[str, FloatArray]:
+        T_root_frame, seen = np.eye(4), {frame}
+        while frame in self._parents:
+            frame, T_parent_child = self._parents[frame]
+            if frame in seen:
+                break  # a loop has no root
+            seen.add(frame)
+            T_root_frame = T_parent_child @ T_root_frame
+        return frame, T_root_frame
+
+
+def moving_frames(bag: Bag) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+    """Stamps ``(M,)`` and ``T_parent_child`` ``(M, 4, 4)`` of the frames of ``/tf``, by parent and child."""
+    found: dict[tuple[str, str], dict[float, FloatArray]] = {}
+    for message in bag.messages(_MOVING_TOPIC) if _MOVING_TOPIC in bag.types else ():
+        for each in message.transforms:
+            stamp = each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec
+            with suppress(ValueError):
+                frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+                found.setdefault(frames, {}).setdefault(stamp, transform_of(each.transform))
+    moving = {}
+    for frames, poses in found.items():
+        stamps = sorted(poses)
+        moving[frames] = np.array(stamps), np.stack([poses[stamp] for stamp in stamps])
+    return moving
+
+
+def frame_name(text: str) -> str:
+    """The name of a frame; ROS 1 may write it with a slash."""
+    return text.removeprefix("/")
+
+
+def transform_of(message: Any) -> FloatArray:
+    """``T_parent_child`` ``(4, 4)`` of a ``Transform`` or a ``Pose``.
+
+    Raises:
+        ValueError: its rotation is none, or its position is not finite.
+    """
+    t = message.translation if hasattr(message, "translation") else message.position
+    q = message.rotation if hasattr(message, "rotation") else message.orientation
+    T: FloatArray = poses_of(np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]]))[0]
+    return T
 
 
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
@@ -177,7 +242,7 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     stamps = stored.messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     calibration = partial(_calibration, bag, topic, fps, (stored.width, stored.height))
-    camera = own_camera(calibration, asked, stored, path.absolute().parent)
+    camera = find_camera_file(asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration)
     mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
     T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)
     return RecordedSequence(
@@ -224,23 +289,27 @@ def _home(topic: str) -> str:
 
 def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps from a topic or frame that is named as truth, NaN where unknown."""
-    topics = bag.topics(*_POSES)
-    for topic in filter(_TRUTH.search, topics):
-        body = getattr(bag.first(topic), "child_frame_id", None)
+    unused = dict.fromkeys(bag.topics(*_POSITIONS), "has positions without rotations")
+    for topic in bag.topics(*_POSES):
+        first = bag.first(topic)
+        body = getattr(first, "child_frame_id", None)
         T_body_camera = np.eye(4) if body is None else mounted.between(body, camera)
-        if T_body_camera is None:
-            logger.warning("%s is not used: no static transform from its %r to the camera's %r", topic, body, camera)
-            continue
-        if body is None:
-            logger.warning("%s does not say whose poses it has: they are taken for the camera's", topic)
-        known, T_any_body = _poses(StampedMessages(bag, topic))
-        return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
+        if not any(map(_TRUTH.search, (topic, first.header.frame_id, body or ""))):
+            unused[topic] = "is not named as truth"
+        elif T_body_camera is None:
+            unused[topic] = f"has no static transform from its {body!r} to the camera's {camera!r}"
+        else:
+            if body is None:
+                logger.warning("%s does not say whose poses it has: they are taken for the camera's", topic)
+            known, T_any_body = _poses(StampedMessages(bag, topic))
+            return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
     for (parent, body), (known, T_any_body) in moving_frames(bag).items():
         T_body_camera = mounted.between(body, camera)
-        if T_body_camera is not None and _TRUTH.search(parent):
+        if T_body_camera is not None and any(map(_TRUTH.search, (parent, body))):
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
-    for topic in (*topics, *bag.topics(_FIX)):
-        logger.warning("%s (%s) is not used: its name does not say that it is the truth", topic, bag.types[topic])
+        unused[f"{parent} to {body} in {_MOVING_TOPIC}"] = "is not named as truth, or not joined to the camera"
+    for topic, reason in unused.items():
+        logger.warning("%s %s: it is not used; a TUM file of true poses is taken by --truth", topic, reason)
     return None
 
 
@@ -293,7 +362,7 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
             raise SequenceError(f"bag {path} has no topic with images of a camera: it holds {held}")
         return {topic: _opener(path, topic, len(topics) > 1, asked) for topic in topics}
     found = {}
-    for file in sorted(path.glob("*.bag")) if path.is_dir() else ():
+    for file in sorted(filter(is_bag, path.iterdir())) if path.is_dir() else ():
         topics = camera_topics(file)
         for topic in topics:
             found[f"{file.stem}{topic}" if len(topics) > 1 else file.stem] = _opener(

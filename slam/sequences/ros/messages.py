@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
-from erfsfm.common.readers.images import Stretch, decode_image
+from erfsfm.common.readers.images import Stretch, decode_image, decode_values
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
+from slam.sequences.foreign_camera import lens_model
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -36,14 +37,6 @@ _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenC
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
 SIXTEEN_BITS = ("mono16", "16UC1")
-_MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
-    "": "pinhole",
-    "none": "pinhole",
-    "plumb_bob": "opencv",
-    "rational_polynomial": "opencv",
-    "equidistant": "fisheye",
-    "fisheye": "fisheye",
-}
 _FLOAT32 = 7  # PointField.FLOAT32
 
 
@@ -56,11 +49,13 @@ def shows_pictures(message: Any, topic: str) -> bool:
 
 
 def values_of(message: Any, where: str) -> NDArray[Any]:
-    """The values ``(H, W, C)`` of an ``Image`` as stored.
+    """The values ``(H, W, C)`` of an ``Image`` as stored, or those of a ``CompressedImage``.
 
     Raises:
         SequenceError: an encoding that is not known, or too few bytes.
     """
+    if hasattr(message, "format"):
+        return decode_values(bytes(message.data), where)
     encoding = message.encoding
     if encoding not in _CONVERSIONS:
         raise SequenceError(f"{where} has encoding {encoding}; known are {', '.join(_CONVERSIONS)}")
@@ -105,15 +100,15 @@ def camera_file_of(
         SequenceError, DataError: it was not calibrated, or the model of the lens is unknown.
     """
     K, P, distortion = (getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd")
-    model = "" if rectified or not np.any(distortion) else info.distortion_model
-    if model not in _MODELS:
-        known = ", ".join(name for name in _MODELS if name)
-        raise SequenceError(f"{where} has distortion_model {model}; known are {known}: give --camera")
+    try:
+        model = lens_model(None if rectified or not np.any(distortion) else info.distortion_model)
+    except DataError as error:
+        raise SequenceError(f"{where}: {error}") from error
     fx, _, cx, *_ = P if rectified else K
     fy, cy = (P[5], P[6]) if rectified else (K[4], K[5])
     if not (fx > 0 and fy > 0):
         raise SequenceError(f"{where} has no calibration, its focal length is {fx:g}: give --camera")
-    width, height, roi = info.width, info.height, info.roi
+    width, height, roi = info.width or (size or (0, 0))[0], info.height or (size or (0, 0))[1], info.roi
     if size != (width, height):
         binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)
         if roi.width and roi.height:
@@ -123,8 +118,8 @@ def camera_file_of(
         cx = (cx - roi.x_offset + 0.5) / binning_x - 0.5
         cy = (cy - roi.y_offset + 0.5) / binning_y - 0.5
     keys = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
-    coefficients = [] if _MODELS[model] == "pinhole" else [float(value) for value in distortion]
-    return camera_of({**keys, "model": _MODELS[model], "distortion": coefficients}, where)
+    coefficients = [] if model == "pinhole" else [float(value) for value in distortion]
+    return camera_of({**keys, "model": model, "distortion": coefficients}, where)
 
 
 def is_rectified(topic: str) -> bool:

@@ -8,7 +8,7 @@ from threading import Thread
 import pytest
 
 from erfsfm.common.errors import BusyError
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 
 
 def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:

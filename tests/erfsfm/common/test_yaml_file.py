@@ -44,7 +44,7 @@ def test_files(tmp_path: Path) -> None:
     with pytest.raises(YamlError, match=r"a\.yaml is not YAML: it is not UTF-8"):
         read_yaml(path)
     path.write_text("# comment\n" * (MAX_BYTES // 10 + 1))
-    with pytest.raises(YamlError, match="larger than 256 KiB"):
+    with pytest.raises(YamlError, match=r"larger than 0\.25 MiB"):
         read_yaml(path)
     for wrong in (tmp_path, tmp_path / "none.yaml", Path("/dev/zero")):
         with pytest.raises(YamlError, match="not there, or not a file"):

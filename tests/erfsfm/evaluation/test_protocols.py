@@ -43,7 +43,7 @@ STEP = (0.05, 0.0, 0.1)
 
 def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=11, depth=True, seed=600, step=STEP)
-    networks, median = depth_protocol(Oracle(STEP), [tmp_path], allow_leak=False)
+    networks, median = depth_protocol({"networks": Oracle(STEP)}, [tmp_path], allow_leak=False)
     assert networks["images"] == 3, "every fifth frame"
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
     assert networks["scale"] == pytest.approx(np.mean([6.0, 5.5, 5.0]) / 3, abs=1e-3)
@@ -57,7 +57,7 @@ def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small:
     roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
     data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3}
     prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
-    networks, _ = depth_protocol(Oracle(STEP), [tmp_path / "prepared"], allow_leak=False)
+    networks, _ = depth_protocol({"networks": Oracle(STEP)}, [tmp_path / "prepared"], allow_leak=False)
     assert networks["images"] == 3
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
 

@@ -1,4 +1,4 @@
-"""Depth errors over several streets: each counts alike, with a standard error by blocks of images."""
+"""Depth errors over several streets: each counts alike, with standard errors are those over streets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.evaluation.depth_metrics import block_error
+from erfsfm.evaluation.depth_metrics import mean_ratio, standard_error
 from erfsfm.evaluation.protocols import depth_protocol
 
 
@@ -27,6 +27,13 @@ class Flat:
         return [name for name in names if name.startswith("kitti_odometry/")]
 
 
+class Slanted(Flat):
+    """Depth that grows to the right."""
+
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return super().depth(image) * np.linspace(1, 2, image.shape[1], dtype=np.float32)
+
+
 def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
     """Images with four known depths: 10 m, and one of 20 m where ``farther``, which makes an AbsRel of 0.125."""
     for folder in ("images", "truth"):
@@ -40,39 +47,60 @@ def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
         cv2.imwrite(str(root / "truth" / f"{street}_{index:06d}.png"), truth)
 
 
-def test_standard_error_is_that_of_blocks() -> None:
-    assert block_error([1.0] * 5 + [3.0] * 5) == pytest.approx(1.0), "standard deviation sqrt(2) of two blocks"
-    assert block_error([2.0] * 6 + [4.0] * 5) == pytest.approx(1.0), "blocks of six and five"
-    assert block_error([0.0, 1.0] * 4 + [0.0]) is None
+def test_standard_error_and_ratio_are_those_over_streets() -> None:
+    assert standard_error([1.0, 3.0]) == pytest.approx(1.0), "a standard deviation of sqrt(2) of two streets"
+    assert standard_error([1.0]) is None
+    ratio, error = mean_ratio([0.1, 0.4], to=[0.2, 0.2])
+    assert ratio == pytest.approx(1.0) and error == pytest.approx(np.log(2))
+    assert mean_ratio([0.1], to=[0.2]) == (pytest.approx(0.5), None)
 
 
 def test_streets_count_alike_and_have_standard_errors(tmp_path: Path) -> None:
     write_pairs(tmp_path / "pairs", "06", [True] * 5 + [False] * 5)
     write_pairs(tmp_path / "pairs", "08", [False] * 20)
-    mean, first, second = depth_protocol(Flat(), [tmp_path / "pairs"], allow_leak=False)  # type: ignore[arg-type]
+    rows = depth_protocol({"networks": Flat()}, [tmp_path / "pairs"], allow_leak=False)
+    mean, first, second = rows
     assert [row["street"] for row in (first, second)] == ["folder/pairs/06", "folder/pairs/08"]
-    assert [row["images"] for row in (mean, first, second)] == [30, 10, 20]
-    assert first["abs_rel"] == first["abs_rel_se"] == pytest.approx(0.0625)
-    assert second["abs_rel"] == second["abs_rel_se"] == 0
+    assert [row["images"] for row in rows] == [30, 10, 20]
+    assert first["abs_rel"] == pytest.approx(0.0625)
+    assert second["abs_rel"] == 0
     assert mean["abs_rel"] == mean["abs_rel_se"] == pytest.approx(0.0625 / 2), "not by their images"
+    assert first["abs_rel_se"] is None and first["abs_rel_se_reason"] == "one street"
     assert mean["a1"] == pytest.approx((1 - 0.25 / 2 + 1) / 2)
+
+
+def test_networks_are_compared_street_by_street(tmp_path: Path) -> None:
+    write_pairs(tmp_path / "pairs", "06", [True] * 4)
+    write_pairs(tmp_path / "pairs", "08", [True, False])
+    mean, other, *single = depth_protocol({"a": Flat(), "b": Slanted()}, [tmp_path / "pairs"], allow_leak=False)
+    assert "ratio" not in mean
+    assert [(row["method"], row["street"][-2:]) for row in single] == [
+        ("a", "06"),
+        ("b", "06"),
+        ("a", "08"),
+        ("b", "08"),
+    ]
+    ratios = [single[1]["ratio"], single[3]["ratio"]]
+    assert ratios[0] == pytest.approx(single[1]["abs_rel"] / single[0]["abs_rel"])
+    assert other["ratio"] == pytest.approx(np.sqrt(np.prod(ratios)))
+    assert other["ratio_se"] == pytest.approx(other["ratio"] * abs(np.log(ratios[0] / ratios[1])) / 2)
 
 
 def test_drives_with_lidar_and_worlds_are_streets(
     tmp_path: Path, write_drive: Callable[..., Path], write_root: Callable[..., Path]
 ) -> None:
     roots = [write_drive(tmp_path / "raw"), write_root(tmp_path / "world", frames=11, depth=True, seed=600)]
-    rows = depth_protocol(Flat(), roots, allow_leak=False)  # type: ignore[arg-type]
+    rows = depth_protocol({"networks": Flat()}, roots, allow_leak=False)  # type: ignore[arg-type]
     assert [row.get("street") for row in rows] == [None, "kitti_raw/2011_09_26_drive_0099", "simulated/600"]
     assert [row["images"] for row in rows] == [5, 2, 3], "every fifth frame"
     assert rows[0]["abs_rel"] == pytest.approx(0, abs=1e-3)
-    assert rows[0]["abs_rel_se"] is None and "fewer than 10 images" in rows[0]["abs_rel_se_reason"]
+    assert rows[0]["abs_rel_se"] == pytest.approx(0, abs=1e-3)
 
 
 def test_a_leak_of_one_street_is_refused(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_pairs(tmp_path / "pairs", "06", [True])
     roots = [tmp_path / "pairs", write_root(tmp_path / "kitti", frames=2, depth=True)]
     with pytest.raises(DataError, match=r"leak: .* kitti_odometry/00\[0:2\]"):
-        depth_protocol(Flat(), roots, allow_leak=False)  # type: ignore[arg-type]
-    rows = depth_protocol(Flat(), roots, allow_leak=True)  # type: ignore[arg-type]
+        depth_protocol({"networks": Flat()}, roots, allow_leak=False)  # type: ignore[arg-type]
+    rows = depth_protocol({"networks": Flat()}, roots, allow_leak=True)  # type: ignore[arg-type]
     assert [row["leak"] for row in rows] == [True, False, True]

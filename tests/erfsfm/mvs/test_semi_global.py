@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from erfsfm.mvs.semi_global import EDGE_GREY_LEVELS, LARGE_STEP, SMALL_STEP, UNIT, smoothed
+from erfsfm.mvs.sweep import EDGE_GREY_LEVELS, LARGE_STEP, SMALL_STEP, UNIT, smoothed
 
 
 def slowly(costs: np.ndarray, grey: np.ndarray) -> np.ndarray:

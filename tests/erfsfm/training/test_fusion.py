@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from erfsfm.cli import main
-from erfsfm.mvs.evidence import CHANGE, CHANNELS
+from erfsfm.mvs.fusion import CHANGE, CHANNELS
 from erfsfm.networks.fusion_net import FusionNet
 from erfsfm.training.fusion import fusion_loss
 

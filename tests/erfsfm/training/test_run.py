@@ -22,7 +22,7 @@ from torch import Tensor
 
 from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_model
 from erfsfm.common.errors import BusyError, ConfigError, DataError, TrainingError
-from erfsfm.common.lock import FolderLock
+from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import Terminated
 from erfsfm.config import ExperimentConfig, TrainedNetworks, load_experiment
 from erfsfm.data.discovery import discover

@@ -20,11 +20,12 @@ import pytest
 import slam
 import slam.commands.run.run
 from slam.commands.cli import main
+from slam.commands.run.request import LARGEST_SEED, RunRequest
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import read_trajectory
 from slam.results.folder import RunFolder
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import RunError, SlamError
 
 Call = Callable[..., tuple[int, str, str]]
 MakeRun = Callable[..., RunFolder]
@@ -192,7 +193,7 @@ def test_run_prints_interpolated_gaps(call: Call, copy_of_kitti_root: Callable[[
     root = copy_of_kitti_root()
     (root / "sequences" / "sim" / "image_2" / "000007.png").write_bytes(b"no image")
     code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
-    assert code == 0 and re.search(r"^INTERPOLATED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
+    assert code == 0 and re.search(r"^INTERPOLATED: frames 7: .*000007\.png", out, re.MULTILINE)
 
 
 def test_a_run_without_truth_has_no_table_of_dashes(
@@ -363,3 +364,14 @@ def test_doctor(call: Call, kitti_root: Path) -> None:
     assert code == 1 and "nowhere" in out.splitlines()[-1]
     code, out, _ = call("doctor", "--dataset", kitti_root, "--camera", "fov=700")
     assert code == 1 and "700" in out.splitlines()[-1]
+
+
+def test_a_request_names_its_recording(tmp_path: Path) -> None:
+    given = RunRequest.of(dataset=str(tmp_path), camera="fov=70", frames="0:9")
+    assert given.recording.tree() == {"dataset": str(tmp_path), "camera": "fov=70", "frames": "0:9"}
+
+
+@pytest.mark.parametrize("seed", [-1, LARGEST_SEED + 1, "many"])
+def test_a_seed_from_python_is_checked(seed: object) -> None:
+    with pytest.raises(RunError, match="run_slam: seed: "):
+        RunRequest.of(seed=seed)

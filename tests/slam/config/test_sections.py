@@ -15,8 +15,8 @@ def test_default_file_is_the_defaults_complete_and_explained():
 
 
 def test_dump_reads_back(tmp_path):
-    config = load_config(None, ["pose_graph.max_loop_residual=1e-4", "gps.correlation_s=7", "scale.mode=none"])
-    assert config.pose_graph.max_loop_residual == 1e-4
+    config = load_config(None, ["mapping.keyframe_distance_m=1e-4", "gps.correlation_s=7", "scale.mode=none"])
+    assert config.mapping.keyframe_distance_m == 1e-4
     assert config.gps.correlation_s == 7
     path = tmp_path / "mine.yaml"
     path.write_text(dump_yaml(config))
@@ -25,9 +25,9 @@ def test_dump_reads_back(tmp_path):
 
 def test_file_may_be_partial_and_overrides_win(tmp_path):
     path = tmp_path / "mine.yaml"
-    path.write_text("pose_graph: {huber_k: 2e0}\nmapping:\n  voxel_size_m: 1e-1\n")
-    config = load_config(path, ["pose_graph.huber_k=3"])
-    assert config.pose_graph.huber_k == 3.0
+    path.write_text("gps: {sigma_m: 2e0}\nmapping:\n  voxel_size_m: 1e-1\n")
+    config = load_config(path, ["gps.sigma_m=3"])
+    assert config.gps.sigma_m == 3.0
     assert config.mapping.voxel_size_m == 0.1
     path.write_text("")
     assert load_config(path) == SlamConfig()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from slam.evaluation.double_walls import double_wall_share
+from slam.evaluation.map import double_wall_share
 
 SQUARE = np.array([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], float)
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])  # looks along z

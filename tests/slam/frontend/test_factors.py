@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
@@ -52,7 +51,7 @@ def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
 
 
 def factors(measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = ()) -> list[RelativePose]:
-    return with_lidar(make_factors(measured, scale, VisualOdometryConfig()), lidar)
+    return with_lidar(make_factors(measured, scale), lidar)
 
 
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]

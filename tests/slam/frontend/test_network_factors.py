@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.config.sections import PoseGraphConfig
 from slam.evaluation.coverage import coverage
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.network_factors import calibrate_network, chain_raw, network_factors, network_steps
@@ -176,7 +175,7 @@ def test_the_network_makes_no_drive_shorter() -> None:
     factors = network_factors(steps, calibrate_network(steps, geometric, DEPTH_UNIT))
 
     def length(*factors: RelativePose) -> float:
-        graph = PoseGraph(PoseGraphConfig())
+        graph = PoseGraph()
         graph.add_relative(*factors)
         return float(se3.path_distance(graph.optimise(T))[-1])
 

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slam.frames import Intrinsics
 from slam.geometry import se3
-from slam.geometry.resection import consensus, ransac_order, refine
-from slam.geometry.se3 import FloatArray
+from slam.geometry.resection import consensus, pixel_jacobian, ransac_order, resect
+from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, is_se3, rotation_angle
 
 K = np.array([[240.0, 0.0, 160.0], [0.0, 240.0, 60.0], [0.0, 0.0, 1.0]])
 T_CAMERA_POINTS = se3.from_rotation_vector(np.array([0.02, -0.05, 0.01]), np.array([0.1, -0.05, -0.8]))
+INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+T_TRUE = from_rotation_vector(np.array([0.1, -0.2, 0.3]), np.array([0.2, 0.1, -0.3]))
 
 
 def scene(seed: int, noise_px: float = 0.3, outliers: int = 30) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -31,19 +34,19 @@ def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_giv
     points, pixels, is_inlier = scene(5)
     found = consensus(points, pixels, K, 200, 2.0, seed)
     assert found is not None
-    assert set(found[2]) <= set(np.flatnonzero(is_inlier)) and len(found[2]) > 60
-    resection = refine(points, pixels, K, found)
-    error = se3.invert(T_CAMERA_POINTS) @ resection.T_camera_points
+    T_start, inliers = found
+    assert set(inliers) <= set(np.flatnonzero(is_inlier)) and len(inliers) > 60
+    resection = resect([T_start], points[inliers], pixels[inliers], K)
+    error = se3.invert(T_CAMERA_POINTS) @ resection.T_camera_world
     assert np.rad2deg(se3.rotation_angle(error[:3, :3])) < 0.1
     assert np.linalg.norm(error[:3, 3]) < 0.05
-    np.testing.assert_array_equal(resection.inliers, found[2])
 
 
 def test_pixels_without_a_common_camera_have_none() -> None:
     points, _, _ = scene(0)
     pixels = np.random.default_rng(1).uniform(0.0, 300.0, (100, 2))
     found = consensus(points, pixels, K, 200, 0.5)
-    assert found is None or len(found[2]) < 12
+    assert found is None or len(found[1]) < 12
 
 
 def test_sigmas_are_those_of_the_errors_of_refined_cameras() -> None:
@@ -52,9 +55,9 @@ def test_sigmas_are_those_of_the_errors_of_refined_cameras() -> None:
         points, pixels, _ = scene(seed, noise_px=0.5, outliers=0)
         found = consensus(points, pixels, K, 200, 3.0)
         assert found is not None
-        resection = refine(points, pixels, K, found)
-        error = resection.T_camera_points @ se3.invert(T_CAMERA_POINTS)
-        shift = resection.T_camera_points[:3, 3] - T_CAMERA_POINTS[:3, 3]
+        resection = resect([found[0]], points[found[1]], pixels[found[1]], K)
+        error = resection.T_camera_world @ se3.invert(T_CAMERA_POINTS)
+        shift = error[:3, 3]
         turned = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]) / 2
         whitened.append(np.concatenate([turned, shift]) / resection.sigmas)
     rms = np.sqrt(np.square(whitened).mean(axis=0))
@@ -68,3 +71,94 @@ def test_an_order_is_a_permutation_by_its_seed() -> None:
     assert (one != other).any() and (one != np.arange(50)).any()
     np.testing.assert_array_equal(np.sort(one), np.arange(50))
     assert len(ransac_order(0, 3)) == 0
+
+
+def seen(count: int = 80) -> tuple[FloatArray, FloatArray]:
+    points = np.random.default_rng(0).uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 6.0), (count, 3))
+    homogeneous = apply(T_TRUE, points) @ INTRINSICS.K.T
+    return points, homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def test_jacobian_is_the_derivative_of_the_pixels() -> None:
+    X = apply(T_TRUE, seen(10)[0])
+    focal = np.array([500.0, 400.0])
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = 1e-6
+        ahead, behind = (apply(from_rotation_vector(s * step[:3], s * step[3:]), X) for s in (1.0, -1.0))
+        numeric = (ahead[:, :2] / ahead[:, 2:] - behind[:, :2] / behind[:, 2:]) * focal / 2e-6
+        np.testing.assert_allclose(pixel_jacobian(X, focal)[axis].T, numeric, atol=1e-4)
+
+
+def test_finds_the_pose_from_a_far_guess() -> None:
+    points, pixels = seen()
+    pose = resect((np.eye(4),), points, pixels, INTRINSICS.K)
+    np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-6)
+    assert pose.residual_px.max() < 1e-3
+
+
+def test_a_camera_that_moves_and_turns_steadily_stays_rigid() -> None:
+    """Each pose begins at the one predicted by the last two, which fits."""
+    rng = np.random.default_rng(1)
+    T_step = from_rotation_vector(np.array([0.002, 0.02, 0.001]), np.array([0.01, 0.0, -0.03]))
+    true = before = now = np.eye(4)
+    for _ in range(1000):
+        true = T_step @ true
+        points = rng.uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 6.0), (40, 3))
+        predicted = now @ invert(before) @ now
+        found = resect((predicted,), apply(invert(true), points), INTRINSICS.project(points), INTRINSICS.K)
+        before, now = now, found.T_camera_world
+    assert is_se3(now, tolerance=1e-12)
+    assert rotation_angle(now[:3, :3] @ true[:3, :3].T) < 1e-6
+
+
+def test_a_wrong_prediction_does_not_outweigh_the_last_pose() -> None:
+    points, pixels = seen()
+    pixels[:20] += 25.0
+    wrong = from_rotation_vector(np.array([0.0, 0.8, 0.0]), np.array([1.0, 0.0, 0.0])) @ T_TRUE
+    near = from_rotation_vector(np.array([0.0, 0.01, 0.0]), np.array([0.01, 0.0, 0.0])) @ T_TRUE
+    pose = resect((near, wrong), points, pixels, INTRINSICS.K)
+    np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-2)
+    assert (pose.residual_px[20:] < 3.0).all()
+    assert (pose.residual_px[:20] > 3.0).all()
+
+
+def test_sigmas_are_of_the_size_of_the_errors() -> None:
+    points, pixels = seen()
+    rng = np.random.default_rng(3)
+    errors, sigmas = [], []
+    for _ in range(40):
+        pose = resect((T_TRUE,), points, pixels + rng.normal(0.0, 0.5, pixels.shape), INTRINSICS.K)
+        difference = pose.T_camera_world @ np.linalg.inv(T_TRUE)
+        errors.append([rotation_angle(difference[:3, :3]), np.linalg.norm(difference[:3, 3])])
+        sigmas.append([np.linalg.norm(pose.sigmas[:3]), np.linalg.norm(pose.sigmas[3:])])
+    ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / np.mean(sigmas, axis=0)
+    assert (ratio > 0.6).all()
+    assert (ratio < 1.6).all()
+
+
+def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_step() -> None:
+    """All points at wrong depths: the pose is right, with what their parallax is off taken as their uncertainty."""
+    points, pixels = seen(200)
+    first = np.linalg.inv(T_TRUE)[:3, 3] + [0.2, 0.05, 0.0]
+    factor = np.exp(np.random.default_rng(1).normal(0.0, 0.3, (200, 1)))
+    wrong = first + factor * (points - first)
+    exact = resect((T_TRUE,), wrong, pixels, INTRINSICS.K)
+    known = resect((T_TRUE,), wrong, pixels, INTRINSICS.K, spread=0.3 * (wrong - first))
+
+    def turned(T: FloatArray) -> float:
+        return float(rotation_angle(T[:3, :3] @ T_TRUE[:3, :3].T))
+
+    assert turned(known.T_camera_world) < 0.3 * turned(exact.T_camera_world)
+    assert np.median(known.residual_px) < 0.5 * np.median(exact.residual_px)
+
+
+def test_the_majority_is_not_the_world_where_others_have_the_vote() -> None:
+    points, pixels = seen(200)
+    trusted = np.arange(200) < 50
+    T_moved = from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.1, 0.0, 0.0])) @ T_TRUE
+    moved = apply(T_moved, points) @ INTRINSICS.K.T
+    pixels[~trusted] = (moved[:, :2] / moved[:, 2:])[~trusted]
+    pose = resect((T_TRUE, T_moved), points, pixels, INTRINSICS.K, trusted=trusted)
+    np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-6)
+    assert (pose.residual_px[~trusted] > 3.0).all()

@@ -17,8 +17,8 @@ from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.closure import MOST_REJECTED, close_loops
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.verification import Loop
-from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
+from slam.pipeline.run import SlamPipeline
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

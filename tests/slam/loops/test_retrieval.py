@@ -3,9 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slam.config.sections import LoopsConfig
 from slam.frames import View
 from slam.loops.descriptors import hamming
-from slam.loops.retrieval import find_candidates, nearest_words, train_vocabulary
+from slam.loops.retrieval import Apart, find_candidates, nearest_words, train_vocabulary
+from slam.loops.verification import LoopThresholds
+
+THRESHOLDS = LoopThresholds.of_frames(LoopsConfig())
 
 
 def place(rng: np.random.Generator) -> np.ndarray:
@@ -31,6 +35,12 @@ def drive(places: int, again: int) -> list[View]:
     return [view(2 * k + j, seen_again(known[p], rng)) for k, p in enumerate(order) for j in range(2)]
 
 
+def apart(path: np.ndarray) -> Apart:
+    """Thirty frames and fifteen metres."""
+    frames = np.arange(len(path))
+    return lambda rows: (frames[rows, None] - frames >= 30) & (path[rows, None] - path >= 15.0)
+
+
 def test_hamming_counts_bits() -> None:
     rng = np.random.default_rng(1)
     first, second = place(rng), place(rng)[:50]
@@ -50,7 +60,7 @@ def test_descriptors_keep_their_word_through_flipped_bits() -> None:
 
 def test_revisited_places_are_found() -> None:
     views = drive(20, 5)
-    found = find_candidates(views, np.arange(50.0), 15.0)
+    found = find_candidates(views, apart(np.arange(50.0)), THRESHOLDS)
     best = {}
     for candidate in found:
         best.setdefault(candidate.later, candidate)
@@ -62,11 +72,11 @@ def test_revisited_places_are_found() -> None:
 
 @pytest.mark.parametrize("path_m", [np.zeros(50), np.linspace(0.0, 4.0, 50)])
 def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
-    assert find_candidates(drive(20, 5), path_m, 15.0) == []
+    assert find_candidates(drive(20, 5), apart(path_m), THRESHOLDS) == []
 
 
 def test_candidates_are_few_and_apart() -> None:
-    found = find_candidates(drive(20, 5), np.arange(50.0), 15.0)
+    found = find_candidates(drive(20, 5), apart(np.arange(50.0)), THRESHOLDS)
     for later in {c.later for c in found}:
         earlier = [c.earlier for c in found if c.later == later]
         assert len(earlier) <= 2

@@ -9,8 +9,7 @@ from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
 from slam.loops import verification
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
+from slam.loops.verification import Loop, LoopThresholds, LoopVerifier, RejectedLoop
 
 CAMERA = Intrinsics(width=416, height=128, fx=240.0, fy=240.0, cx=207.5, cy=63.5)
 T_A_B = from_rotation_vector(np.array([0.01, 0.08, -0.02]), np.array([0.7, 0.1, 2.0]))

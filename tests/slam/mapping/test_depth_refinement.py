@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from erfsfm.mvs.fusion import DepthFusion
 from slam.frames import Intrinsics
 from slam.mapping.depth_refinement import DepthRefiner
 
@@ -19,7 +20,7 @@ def refiner(distances: np.ndarray, read: list[int]) -> DepthRefiner:
         read.append(n)
         return rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)
 
-    return DepthRefiner(CAMERA, range(len(distances)), T_world_camera, image)
+    return DepthRefiner(CAMERA, range(len(distances)), T_world_camera, image, DepthFusion("default").decide)
 
 
 @pytest.mark.parametrize(("step_m", "expected"), [(1.0, {9, 10, 11, 12}), (0.1, {10, 3, 17, 30})])
@@ -27,13 +28,13 @@ def test_neighbours_are_chosen_by_their_distance(step_m: float, expected: set[in
     read: list[int] = []
     offset = 20 if step_m < 1 else 0
     n = 10 + offset
-    assert refiner(np.arange(80) * step_m, read).refine(n, DEPTH, None) is not None
+    assert refiner(np.arange(80) * step_m, read).refine(n, DEPTH) is not None
     assert {k - offset for k in read} == expected
 
 
 def test_the_last_keyframe_has_its_neighbours_before_it() -> None:
     read: list[int] = []
-    assert refiner(np.arange(20.0), read).refine(19, DEPTH, None) is not None
+    assert refiner(np.arange(20.0), read).refine(19, DEPTH) is not None
     assert set(read) == {17, 18, 19}
 
 
@@ -41,7 +42,7 @@ def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasur
     holes = DEPTH.copy()
     holes[10:20, 20:40] = 0
     holes[0, 0], holes[0, 1] = np.nan, np.inf
-    refined = refiner(np.arange(20.0), []).refine(10, holes, None)
+    refined = refiner(np.arange(20.0), []).refine(10, holes)
     assert refined is not None and np.isfinite(refined.depth).all() and (refined.depth > 0).all()
     unmeasured = ~(np.isfinite(holes) & (holes > 0)) & ~refined.measured
     assert unmeasured.any() and np.isinf(refined.relative_sigma[unmeasured]).all()

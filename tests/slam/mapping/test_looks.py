@@ -5,11 +5,10 @@ import pytest
 
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
-from slam.mapping.colours import evened
 from slam.mapping.filters import DepthFilters, KeyframeDepth
-from slam.mapping.holes import with_holes_closed
 from slam.mapping.map import TsdfMap
-from slam.mapping.tile_surface import TileSurface
+from slam.mapping.tile_surface import TileSurface, with_holes_closed
+from slam.mapping.views import evened
 
 
 def test_exposure_is_evened_out(street_map):

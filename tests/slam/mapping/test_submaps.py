@@ -4,8 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from slam.mapping.merged_submaps import TILE_BLOCKS
-from slam.mapping.submap import BLOCK_SIDE
+from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS
 
 
 def test_submaps_merge_to_the_surface_of_one(street_map):

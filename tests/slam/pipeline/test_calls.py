@@ -15,8 +15,8 @@ from oracle import OracleNoise, OraclePredictor
 from slam.config.sections import KeyframesConfig, load_config
 from slam.loops.descriptors import FeatureExtractor
 from slam.mapping.depth_refinement import DepthRefiner
-from slam.mapping.fusion import Fusion
-from slam.pipeline.batch import SlamPipeline
+from slam.mapping.submap import Fusion
+from slam.pipeline.run import SlamPipeline
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

@@ -7,19 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 import room
-from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig, SlamConfig
-from slam.frames import RelativeSimilarity, View
+from slam.frames import LOOP_SOURCE, RelativePose, View
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
-from slam.loops import maps
-from slam.loops.maps import MapLoop, MapLoops, find_map_loops
-from slam.loops.verification import RejectedLoop
+from slam.loops.closure import LoopClosures, find_loops
+from slam.loops.consistency import Track
+from slam.loops.verification import Loop, RejectedLoop
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
@@ -80,9 +79,9 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
     position, rotation = errors(after.poses, truth)
     assert position < 0.01
     assert rotation < 0.3
-    for pose, loop in zip(after.poses.loops, after.loops, strict=True):
+    for pose, loop in zip(after.poses.loops, after.loops.accepted, strict=True):
         T = invert(truth[pose.from_index]) @ truth[pose.to_index]
-        assert np.rad2deg(rotation_angle(T[:3, :3].T @ loop.similarity.T_from_to[:3, :3])) < 3.0
+        assert np.rad2deg(rotation_angle(T[:3, :3].T @ loop.measured.T_from_to[:3, :3])) < 3.0
 
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value")  # it has no corners
@@ -90,14 +89,15 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
 def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop within the first map is added by hand, for in this small room the window finds such places itself."""
 
-    def find(views: Sequence[View], T_map_camera: FloatArray, maps: NDArray[np.intp], *rest: Any) -> MapLoops:
-        found = find_map_loops(views, T_map_camera, maps, *rest)
-        last = int(np.flatnonzero(maps == 0)[-1])
-        within = RelativeSimilarity(0, last, invert(T_map_camera[0]) @ T_map_camera[last], 1.0, np.full(7, 0.01))
-        loop = MapLoop(within, np.zeros((0, 2), np.intp), 1 + max(each.inliers for each in found.found), 1.0)
-        return replace(found, found=(*found.found, loop))
+    def find(views: Sequence[View], track: Track, *rest: Any) -> LoopClosures:
+        closures = find_loops(views, track, *rest)
+        last = int(np.flatnonzero(track.maps == 0)[-1])
+        T = invert(track.T_world_camera[0]) @ track.T_world_camera[last]
+        within = RelativePose(int(track.frames[0]), int(track.frames[last]), T, np.full(6, 0.01), LOOP_SOURCE)
+        loop = Loop(within, 1 + max(loop.inliers for loop in closures.accepted), 1.0)
+        return replace(closures, accepted=(*closures.accepted, loop))
 
-    monkeypatch.setattr(map_closure, "find_map_loops", find)
+    monkeypatch.setattr(map_closure, "find_loops", find)
     back, closer = there_and_back(90, roll=0.02), there_and_back(110, roll=0.5, closer=0.3)
     truth = np.concatenate([back, back[:6], closer[95:]])
     after = closed(room.tracked(CONFIG.keyframes, truth, [0] * 90 + [9] * 6 + [0] * 15))
@@ -149,7 +149,8 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
 
 
 def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(maps, "OF_KEYFRAMES", replace(maps.OF_KEYFRAMES, min_support=99, alone_inliers=10_000))
+    strict = replace(map_closure.OF_KEYFRAMES, min_support=99, alone_inliers=10_000)
+    monkeypatch.setattr(map_closure, "OF_KEYFRAMES", strict)
     truth, state = lost_on_the_way()
     after = closed(state)
     unit = MeasurementFailure("no road")
@@ -174,7 +175,7 @@ def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.Monk
 def test_another_scene_is_no_loop() -> None:
     walked = there_and_back(110)
     after = closed(room.tracked(CONFIG.keyframes, np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
-    assert after.loops == ()
+    assert after.loops.accepted == ()
     assert after.joins == ()
     assert len(set(after.poses.segments.values())) == 2
 
@@ -182,7 +183,9 @@ def test_another_scene_is_no_loop() -> None:
 def test_a_rejected_loop_from_a_map_without_poses_has_a_length() -> None:
     loop = RejectedLoop(0, 5, "few corners", 0.5, 9, from_rotation_vector(np.zeros(3), np.ones(3)))
     scale = Scale("none", MeasurementFailure("no road"), np.full(6, 3.0), {}, "the networks' own unit")
-    (rejected,) = MapClosure(KeyframePoses(), rejected=(loop,), learned_units={0: 2.0}).closures(scale).rejected
+    (rejected,) = (
+        MapClosure(KeyframePoses(), LoopClosures(rejected=(loop,)), learned_units={0: 2.0}).closures(scale).rejected
+    )
     assert rejected.T_from_to is not None
     np.testing.assert_array_equal(rejected.T_from_to[:3, 3], 6.0)
 
@@ -208,7 +211,7 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
     T_world_camera[:, :3] = truth
     assert sorted(before.segments) == list(range(80))
     T_world_camera = T_world_camera[indices]
-    assert len(after.loops) >= 8
+    assert len(after.loops.accepted) >= 8
     for pose in after.poses.loops:
         T = invert(T_world_camera[pose.from_index]) @ T_world_camera[pose.to_index]
         assert np.rad2deg(rotation_angle(T[:3, :3].T @ pose.T_from_to[:3, :3])) < 5.0

@@ -21,11 +21,9 @@ from slam.frames import Frame
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.geometry.se3 import FloatArray
-from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.observations import Observations
-from slam.pipeline.observer import Observer
-from slam.pipeline.pending import read_frame
+from slam.pipeline.observer import Observations, Observer
+from slam.pipeline.run import SlamPipeline, read_frame
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.timing import Stopwatch
 from slam.sequences.simulated import SimulatedSequence

@@ -12,9 +12,9 @@ from slam.frontend.failure import MeasurementFailure
 from slam.geometry import se3
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.se3 import FloatArray
-from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
+from slam.pipeline.run import SlamPipeline
 from slam.runtime.errors import ConfigError, SlamError
 from slam.sequences.recording import RecordedSequence
 

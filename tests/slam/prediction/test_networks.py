@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from erfsfm.inference import DepthPosePredictor, PreparedImage
 from slam.frames import Frame, Image, Intrinsics, Predictor
-from slam.prediction.networks import NetworkPredictor
+from slam.prediction.assembly import NetworkPredictor
 
 CAMERA = Intrinsics(160, 48, 90.0, 90.0, 79.5, 23.5)
 

@@ -5,8 +5,8 @@ import numpy as np
 from slam.frames import Intrinsics
 from slam.mapping.filters import KeyframeDepth
 from slam.results.depth import DepthQuality, projected, true_depth
-from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.excerpt import Excerpt
+from slam.sequences.images import DepthMaps
 from slam.sequences.recording import RecordedSequence, Source
 
 CAMERA = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5)
@@ -56,7 +56,7 @@ def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(tmp_path, 
     quality = DepthQuality(sequence, is_metric=True)
     for _ in range(2):
         quality.add(keyframe())
-    assert quality.metrics(True).network.reason == "the true depth of 2 keyframes cannot be read"
+    assert quality.metrics(True).network.absent == "the true depth of 2 keyframes cannot be read"
     assert len(caplog.messages) == 1 and "000002.png" in caplog.messages[0]
 
 

@@ -13,10 +13,15 @@ import pytest
 import slam
 from slam.results.folder import RunFolder
 from slam.results.metrics import MapMetrics, Metrics, Provenance
+from slam.runtime.attempt import Failed
 from slam.runtime.errors import RunError
-from slam.runtime.storage.record import Missing
 
 MakeRun = Callable[..., RunFolder]
+
+
+def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="nowhere is not there"):
+        RunFolder(tmp_path / "nowhere")
 
 
 def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path: Path) -> None:
@@ -127,10 +132,10 @@ def test_trajectories_survive_a_round_trip(make_run: MakeRun) -> None:
 def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -> None:
     folder = make_run()
     (folder.path / "map_mesh.ply").unlink()
-    folder.write_metrics(folder.metrics().changed(map=MapMetrics.missing(reason)))
+    folder.write_metrics(folder.metrics().changed(map=MapMetrics.unknown(reason)))
     with pytest.raises(RunError, match=re.escape(f"has no map_mesh.ply: {reason}")):
         folder.require("map_mesh.ply")
-    folder.write_metrics(folder.metrics().changed(map=Missing("the run ended before its map was whole")))
+    folder.write_metrics(folder.metrics().changed(map=Failed("the run ended before its map was whole")))
     with pytest.raises(RunError, match=r"has no map_mesh\.ply: the run ended before its map was whole"):
         folder.require("map_mesh.ply")
 

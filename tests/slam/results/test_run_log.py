@@ -18,14 +18,16 @@ def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alo
     with run_log() as log:
         LOGGER.info("checked")
         log.begin(tmp_path / "run.log")
-        LOGGER.info("measured")
+        for frame in range(9):
+            LOGGER.info("frame %d failed: %s", frame, "no road")
         log.failed("no space")
     LOGGER.warning("after it")
     lines = (tmp_path / "run.log").read_text().splitlines()
     assert [line.split(" ", 2)[2] for line in lines] == [
         "INFO slam.test: checked",
-        "INFO slam.test: measured",
+        "INFO slam.test: frame 0 failed: no road",
         "ERROR slam.commands.run.run: the run failed: no space",
+        "INFO slam.commands.run.run: 9 times: no road",
     ]
     assert "no space" not in caplog.text
 

@@ -32,7 +32,7 @@ def test_sequence_without_images_says_so(tmp_path: Path, odometry) -> None:
     (tmp_path / "sequences/09").mkdir()
     (tmp_path / "sequences/09/calib.txt").write_text("")
     assert sequence_names(tmp_path) == ["00"]
-    with pytest.raises(SequenceError, match=r"no images in .*09: looked for .*image_2.*; found calib\.txt"):
+    with pytest.raises(SequenceError, match=r"no images in .*09: looked for .*image_2"):
         open_sequence(tmp_path, "09", None, None)
 
 

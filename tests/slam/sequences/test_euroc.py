@@ -1,7 +1,6 @@
 """EuRoC's layout: distorted images, stamps in nanoseconds, true poses of the body, rows without an image."""
 
 import logging
-import re
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +91,7 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
     write_truth(flight, 0, FRAMES)
     sequence = open_sequence(flight, camera=given)
     assert sequence.intrinsics.fx == 30 and sequence.reference is None
-    assert re.search(r"true poses in .* are not used: .*sensor\.yaml, which says where", caplog.text)
+    assert "sensor.yaml, which says where" in caplog.text
     sensor.write_text(SENSOR)
     (flight.parent / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.2\n")
     sequence = open_sequence(flight)
@@ -102,8 +101,8 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
 @pytest.mark.parametrize(
     "name, old, new, message",
     [
-        ("sensor.yaml", "radial-tangential", "omni", "distortion_model omni: known are .*give --camera"),
-        ("sensor.yaml", "rate_hz: 20\n", "", "needs resolution, intrinsics .* and rate_hz: KeyError"),
+        ("sensor.yaml", "radial-tangential", "omni", "omni is unknown: known are .*give --camera"),
+        ("sensor.yaml", "resolution: [", "size: [", "key width is missing"),
         ("sensor.yaml", "[30, 30, 20, 12]", "[30, 30, 200, 12]", r"sensor\.yaml: cx, cy: \(200, 12\) lies outside"),
         ("sensor.yaml", "T_BS", "T_SB", "needs T_BS with data of 4 x 4 numbers"),
         ("sensor.yaml", "rate_hz: 20", "rate_hz: !!python/object/apply:os.getcwd []", "could not determine"),

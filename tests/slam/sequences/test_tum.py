@@ -63,7 +63,6 @@ def test_uncovered_images_mean_no_reference(folder: Path, caplog: pytest.LogCapt
         ("100.0 rgb/100.02.png extra\n", "line 1: .*is not 'stamp file'"),
         ("soon rgb/100.02.png\n", "line 1: .*is not 'stamp file'"),
         ("100.0 rgb/gone.png\n", "none of the 1 images"),
-        ("100.2 rgb/100.02.png\n100.1 rgb/100.05.png\n", "line 1: stamps must increase"),
     ],
 )
 def test_malformed_index(folder: Path, text: str, message: str) -> None:
@@ -84,7 +83,7 @@ def test_bad_rows_are_left_out(folder: Path, caplog: pytest.LogCaptureFixture) -
 
 def test_needs_a_camera_file(folder: Path) -> None:
     (folder / "camera.yaml").unlink()
-    with pytest.raises(SequenceError, match=r"no camera\.yaml for TUM folder"):
+    with pytest.raises(SequenceError, match=r"no camera\.yaml for "):
         open_sequence(folder, None, None, None)
 
 

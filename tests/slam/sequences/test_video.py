@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.video import VideoFrames
-from slam.sequences import video
+from slam.sequences import folder as video
 from slam.sequences.catalogue import open_sequence
 
 

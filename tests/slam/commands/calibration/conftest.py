@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam.commands.calibration.board import Board
+from slam.commands.board import Board
 
 _FINE = 2
 _TEXEL_PX = 24  # of the texture, a square

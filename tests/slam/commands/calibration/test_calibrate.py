@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
-from slam.commands.calibration.board import Board
+from slam.commands.board import Board
 from slam.commands.cli import main
 from slam.sequences.catalogue import open_sequence
 
@@ -61,7 +61,7 @@ def test_a_known_camera_is_found(
     require_close(camera, studio)
     assert camera.source is not None and "views of a 9x6" in camera.source
     picture = cv2.imread(str(tmp_path / "camera.png"))
-    assert picture is not None and picture.shape == (950, 1300, 3) and picture.std() > 20
+    assert picture is not None and picture.shape == (500, 1300, 3) and picture.std() > 20
     sequence = open_sequence(folder, camera=tmp_path / "camera.yaml")  # run reads it
     assert sequence.frame(0).image.shape == (360, 480, 3)
 
@@ -106,12 +106,8 @@ def test_a_video_gives_its_rate(tmp_path: Path, make_studio, make_views, calibra
     [
         ("frontal", [], "all 9 views are frontal .*do not determine the focal length; tilt it by 20 to 45"),
         ("few", [], "3 of 3 images show the whole 9x6 chessboard, 8 are needed: take 20 or more"),
-        ("outside", [], "0 of 4 images show the whole 9x6 chessboard.*others show a part of a chessboard"),
-        (
-            "tilted",
-            ["--board", "8x6"],
-            "[012] of 4 images show the whole 8x6 chessboard.*or count the corners between its squares again",
-        ),
+        ("outside", [], "0 of 4 images show the whole 9x6 chessboard.*with all of the board in them"),
+        ("tilted", ["--board", "8x6"], "[012] of 4 images show the whole 8x6 chessboard.*counts the corners between"),
         ("far", [], "was seen in .* % of the image alone|leave the focal length uncertain"),
         ("tilted", ["--board", "nine"], "--board nine is no board"),
         ("tilted", ["--pattern", "charuco", "--dictionary", "9X9_1"], "--dictionary 9X9_1 is none of OpenCV's"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.commands.exports.export import export
+from slam.commands.export import export
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame
 from slam.geometry.se3 import FloatArray, apply, invert

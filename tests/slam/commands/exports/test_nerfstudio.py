@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.commands.exports.export import export
-from slam.commands.exports.parts import R_UP_WORLDS
+from slam.commands.export import R_UP_WORLDS, export
 from slam.formats.ply import Ply
 from slam.geometry.se3 import invert
 from slam.results.folder import RunFolder

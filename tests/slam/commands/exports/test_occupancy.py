@@ -12,10 +12,8 @@ import yaml
 from meshes import coloured_ply
 
 from slam.commands.cli import app
-from slam.commands.exports.export import export
-from slam.commands.exports.ground import ground_along
-from slam.commands.exports.occupancy import occupancy_grid
-from slam.commands.exports.sampling import Grid, samples
+from slam.commands.export import export
+from slam.commands.occupancy import Grid, ground_along, occupancy_grid, samples
 from slam.formats.ply import Ply
 from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN, write_ros_map
 from slam.geometry import se3
@@ -98,13 +96,13 @@ def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resol
         vertices[axis] *= unit
     poses = poses.copy()
     poses[:, :3, 3] *= unit
-    grid = occupancy_grid(Ply(vertices, mesh.triangles), poses, resolution * unit, unit == 1.0)
-    shape, corner, step = grid.cells.shape, np.array(grid.corner) / unit, grid.resolution / unit
+    values, grid = occupancy_grid(Ply(vertices, mesh.triangles), poses, resolution * unit, unit == 1.0)
+    shape, corner, step = grid.shape, np.array([grid.x_min, grid.y_min]) / unit, grid.resolution / unit
 
     def cells(x: tuple[float, float], y: tuple[float, float]) -> np.ndarray:
         first, last = (int((value - corner[0]) / step) for value in x)
         low, high = (shape[0] - 1 - int((value - corner[1]) / step) for value in y)
-        return grid.cells[high : low + 1, first : last + 1]
+        return values[high : low + 1, first : last + 1]
 
     assert (cells((-6, 4), (1, 28)) == FREE).mean() > 0.99
     assert (cells((5.2, 6.8), (1, 50)) == FREE).mean() > 0.99  # the kerb
@@ -112,15 +110,15 @@ def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resol
     assert (cells((-2, 2), (45, 47)) == FREE).mean() > 0.99  # under the canopy
     assert (cells((-8.5, -8.5), (1, 50)) == OCCUPIED).mean() > 0.99  # the wall
     assert (cells((-7.9, -7.6), (1, 50)) == UNKNOWN).mean() > 0.9
-    assert (grid.cells == OCCUPIED).sum() * step**2 == pytest.approx(2 * 4 + 60 * step, rel=0.15)
+    assert (values == OCCUPIED).sum() * step**2 == pytest.approx(2 * 4 + 60 * step, rel=0.15)
 
 
 def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(street: tuple[Ply, FloatArray]) -> None:
     _, poses = street
     parts = [level((-3, 3.2), along, 0.0) for along in ((-1, 10), (10.2, 20), (21.5, 60))]
-    grid = occupancy_grid(together(*parts), poses, 0.1, True)
+    values, grid = occupancy_grid(together(*parts), poses, 0.1, True)
     # the last rows of the parts lie at 9.8, 19.8 and 59.8
-    of_y = {y: grid.cells[grid.cells.shape[0] - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)}
+    of_y = {y: values[grid.height - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)}
     assert {y: set(row.tolist()) for y, row in of_y.items()} == {
         9.9: {FREE},
         10.1: {FREE},
@@ -140,9 +138,9 @@ def test_large_triangles_leave_no_holes_and_keep_their_area() -> None:
     floor = coloured_ply(corners, np.zeros((4, 3)), np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]]))
     grid = Grid.around(floor.points, 0.07)
     area, seen = 0.0, np.zeros(grid.width * grid.height, bool)
-    for part in samples(floor, grid):
-        area += part.areas.sum()
-        seen[grid.cells(part.points)] = True
+    for points, areas in samples(floor, 0.07):
+        area += areas.sum()
+        seen[grid.cells(points)] = True
     assert area == pytest.approx(200) and seen.mean() > 0.985  # the border cells are cut by the edge
 
 

@@ -24,13 +24,11 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live.reader import Reader
-from slam.commands.live.request import LiveRequest
-from slam.commands.live.run import run_live
-from slam.commands.live.sequence import StreamedSequence, calibration_of
+from slam.commands.live.reader import Reader, StreamedSequence, calibration_of
+from slam.commands.live.run import LiveRequest, run_live
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
-from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.runtime.errors import SequenceError, SlamError
 from slam.sequences.camera_file import explicit_camera
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
@@ -103,11 +101,11 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
 
 @pytest.mark.parametrize(("mode", "unit"), [("auto", None), ("none", "the networks' own unit")])
 def test_without_a_road_there_are_no_metres_and_no_camera_heights(
-    street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None
+    street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("slam.frontend.scale.road_plane._ROAD_ROWS", (0.0, 0.001))  # at the horizon
     target, messages = filled(street, tmp_path)
-    at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
-    settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
+    settings = (*SETTINGS, "road.enabled=false", f"scale.mode={mode}")
     request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     recorded = folder.metrics().tree()["scale"]
@@ -181,7 +179,7 @@ def test_what_the_settings_need_is_asked_before_the_first_frame(
     """A camera by its field of view alone has no height; frames that come have no scans and no numbers."""
     settings = (*SETTINGS, *settings)
     images, messages = str(street / "images"), []
-    request = request_of(images, tiny_weights, settings, tmp_path / "live", calibration=Path("fov=70"), wait=0.5)
+    request = request_of(images, tiny_weights, settings, tmp_path / "live", camera=Path("fov=70"), wait=0.5)
     with pytest.raises(SlamError, match=words):
         run_live(request, messages.append)
     assert messages == [] and not (tmp_path / "live").exists()
@@ -262,15 +260,6 @@ def test_only_a_source_that_is_stored_can_wait(street: Path) -> None:
     camera = explicit_camera(Path("fov=70"), source, 10.0)
     with pytest.raises(SequenceError, match="door does not wait while an image is measured: leave out --every-frame"):
         StreamedSequence("door", source, camera, 1.0, every_frame=True)
-
-
-def test_dataset_and_camera_mean_what_they_mean_in_run() -> None:
-    as_in_run = LiveRequest(dataset="0", camera="camera.yaml")
-    assert (as_in_run.source, as_in_run.camera_file) == ("0", Path("camera.yaml"))
-    before = LiveRequest(camera="0", calibration=Path("camera.yaml"))
-    assert (before.source, before.camera_file) == ("0", Path("camera.yaml"))
-    with pytest.raises(RunError, match="name where images come from: --dataset 0"):
-        _ = LiveRequest().source
 
 
 def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
@@ -442,8 +431,8 @@ def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path:
     output, target, messages = tmp_path / "run", tmp_path / "images", []
     target.mkdir()
     fill(street / "images", target, messages, vanishes=False)
-    command = [sys.executable, "-m", "slam", "live", "--camera", str(target), "--output", str(output), "--wait", "600"]
-    command += ["--calibration", str(street / "camera.yaml")]
+    command = [sys.executable, "-m", "slam", "live", "--dataset", str(target), "--output", str(output), "--wait", "600"]
+    command += ["--camera", str(street / "camera.yaml")]
     command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]
     heeded = partial(signal.signal, number, signal.SIG_DFL)  # what a shell runs in the background ignores ctrl-C
     pipe = subprocess.PIPE

@@ -17,13 +17,11 @@ import slam.commands.run.run
 import slam.results.estimate_metrics
 from erfsfm.common.signals import Terminated
 from slam import run_slam
-from slam.commands.run import job
-from slam.config.sections import PoseGraphConfig
+from slam.commands.run import recorder
 from slam.graph.pose_graph import PoseGraph
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.storage.record import Missing
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -175,13 +173,13 @@ def test_unreadable_scans_are_left_out_and_reported(
 def test_a_run_that_is_killed_while_its_report_is_written_has_not_ended(
     reported: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen, write = [], job.write_report
+    seen, write = [], recorder.write_report
 
     def spied(folder: RunFolder, *parts: Any) -> None:
         seen.append(folder.metrics().status)
         write(folder, *parts)
 
-    monkeypatch.setattr(job, "write_report", spied)
+    monkeypatch.setattr(recorder, "write_report", spied)
     folder = run_slam(**reported, output=tmp_path / "run")
     assert seen == ["estimated"] and folder.metrics().status == "ok"
     assert ">FAILED<" not in (folder.path / "report.html").read_text()
@@ -203,7 +201,7 @@ def test_however_a_run_ends_its_folder_has_the_reason(
     def stop(self: SlamPipeline, *_: object) -> None:
         raise error
 
-    monkeypatch.setattr(SlamPipeline, "estimate", stop)
+    monkeypatch.setattr(SlamPipeline, "run", stop)
     with pytest.raises(type(error)):
         run_slam(**quick, output=tmp_path / "ended")
     metrics = RunFolder.open(tmp_path / "ended").metrics().tree()
@@ -233,9 +231,9 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
     class Result:
         optimised = run.trajectory("network")
         reference = run.trajectory("reference")
-        graph = PoseGraph(PoseGraphConfig())
+        graph = PoseGraph()
 
     assert Result.optimised is not None
     Result.optimised.T_world_camera[:] = np.eye(4)
     graph = slam.results.estimate_metrics._graph(Result)  # type: ignore[arg-type]
-    assert isinstance(graph.coverage, Missing) and "does not move" in graph.coverage.reason
+    assert "does not move" in graph.coverage.absent

@@ -14,7 +14,7 @@ import yaml
 
 import slam.commands.cli
 from slam import Slam, run_slam
-from slam.commands.localisation.localiser import localise
+from slam.commands.localisation import localise
 from slam.config.sections import DepthConfig, load_config
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers
 from slam.results.folder import RunFolder

@@ -19,9 +19,11 @@ from erfsfm.common.errors import BusyError
 from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.commands.cli import main
+from slam.commands.run.recorder import FolderRecorder
 from slam.formats.ply import read_ply
 from slam.formats.trajectory import read_trajectory
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.observer import Observer
+from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 
@@ -182,10 +184,10 @@ def test_a_stage_that_fails_costs_its_results(
         raise KeyError(0)
 
     place = {
-        "loops": "slam.pipeline.batch.close_loops",
+        "loops": "slam.pipeline.run.close_loops",
         "graph": "slam.graph.pose_graph.PoseGraph.optimise",
-        "map": "slam.pipeline.batch.SlamPipeline.fuse",
-        "report": "slam.commands.run.job.write_report",
+        "map": "slam.pipeline.run.SlamPipeline.fuse",
+        "report": "slam.commands.run.recorder.write_report",
     }
     monkeypatch.setattr(place[stage], failing)
     words = ["--dataset", quick["dataset"], "--weights", quick["weights"], "--frames", "0:8"]
@@ -202,6 +204,30 @@ def test_a_stage_that_fails_costs_its_results(
         assert metrics[part][name] is None and "KeyError" in metrics[part][f"{name}_reason"]
     assert (tmp_path / "run/report.html").is_file() == (stage != "report")
     assert (tmp_path / "run/graph.g2o").is_file() == (stage != "graph")
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_during_the_pass_leaves_a_whole_run_of_what_was_seen(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    def interrupted(self: FolderRecorder, observer: Observer) -> None:
+        if observer.frames == 6:
+            os.kill(os.getpid(), getattr(signal, name))
+
+    monkeypatch.setattr(FolderRecorder, "frame", interrupted)
+    folder = run_slam(**quick, output=tmp_path / "run")
+    metrics = folder.metrics()
+    assert (metrics.status, metrics.sequence.frames) == ("ok", 6)
+    assert "the first 6 of 8 frames" in caplog.text
+    assert all(len(folder.trajectory(each) or ()) == 6 for each in ("network", "optimised", "reference"))
+
+
+def test_a_signal_before_the_first_snippet_ends_a_run(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FolderRecorder, "frame", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(SlamError, match="interrupted after 1 frames"):
+        run_slam(**quick, output=tmp_path / "run")
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
@@ -235,7 +261,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from slam import run_slam
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.run import SlamPipeline
 
 def kill(*_):
     os.kill(os.getpid(), signal.SIGKILL)

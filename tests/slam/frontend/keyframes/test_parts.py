@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.map_segment import MapSegment
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.keyframes.unit import learned_unit

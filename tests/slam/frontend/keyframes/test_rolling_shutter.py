@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.rolling_shutter import in_middle_row, measured_turn
+from slam.frontend.keyframes.image_turn import in_middle_row, measured_turn
 
 CAMERA = Intrinsics(320, 240, 290.0, 290.0, 159.5, 119.5, readout_s=0.03)
 TURN = np.array([0.3, -0.8, 0.4])  # radians a second

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.config.sections import LengthConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
@@ -50,7 +49,7 @@ def measured(
 
 
 def find(mode, measurements: tuple[Drive, list[RelativePose]], height_m: float | None = HEIGHT_M) -> Scale:
-    return find_scale(mode, height_m, *measurements, LengthConfig())
+    return find_scale(mode, height_m, *measurements)
 
 
 def lengths(scale: Scale) -> dict[Ends, float]:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from slam.config.sections import RoadConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale import road_homography
@@ -15,7 +14,6 @@ from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.geometry import se3
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
-CONFIG = RoadConfig()
 HEIGHT_M = 1.65
 RAYS = CAMERA.rays(CAMERA.pixel_grid())
 
@@ -62,7 +60,7 @@ def measure(texture, step: np.ndarray, pitch_deg: float = 0.0, car_ahead=False) 
     current = render(step @ T_body_camera, texture, 1, car_ahead)
     T_previous_current = se3.invert(T_body_camera) @ step @ T_body_camera
     T_previous_current[:3, 3] *= 7.0
-    return RoadHomography(CONFIG, CAMERA).measure(previous, current, T_previous_current)
+    return RoadHomography(CAMERA).measure(previous, current, T_previous_current)
 
 
 @pytest.mark.parametrize("length_m", [0.15, 0.6, 1.3, 2.4])
@@ -82,7 +80,7 @@ def test_lengths_are_right_on_average(texture):
         T_road_camera = se3.make(np.eye(3), np.array([3.7 * k, 0.0, 11.3 * k % 20]))
         ahead = se3.make(np.eye(3), np.array([0.0, 0.0, 0.6 if k % 2 else 1.1]))
         frames = [render(T, texture, index) for index, T in enumerate((T_road_camera, T_road_camera @ ahead))]
-        road = RoadHomography(CONFIG, CAMERA).measure(*frames, ahead)
+        road = RoadHomography(CAMERA).measure(*frames, ahead)
         assert isinstance(road, RoadStep)
         ratios.append(road.length_heights * HEIGHT_M / ahead[2, 3])
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.005)
@@ -98,29 +96,29 @@ def test_a_car_ahead_does_not_shorten_the_step(texture):
 def test_a_car_that_covers_the_road_is_refused(texture):
     """All that the strip shows far ahead drives as fast as the camera, and below it the road is even."""
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    failure = RoadHomography(CONFIG, CAMERA).measure(*behind_a_car(texture, rows=90), step)
+    failure = RoadHomography(CAMERA).measure(*behind_a_car(texture, rows=90), step)
     assert isinstance(failure, MeasurementFailure) and "stands still" in failure.reason
 
 
-def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture):
+def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture, monkeypatch):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     frames = behind_a_car(texture, rows=76)
-    road = RoadHomography(CONFIG, CAMERA).measure(*frames, step)
+    road = RoadHomography(CAMERA).measure(*frames, step)
     assert isinstance(road, RoadStep)
     assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.1)
     assert road.relative_sigma >= 0.1
-    long_only = RoadConfig(near_heights=0.1)
-    assert isinstance(RoadHomography(long_only, CAMERA).measure(*frames, step), MeasurementFailure)
+    monkeypatch.setattr("slam.frontend.scale.road_homography.NEAR_HEIGHTS", 0.1)
+    assert isinstance(RoadHomography(CAMERA).measure(*frames, step), MeasurementFailure)
 
 
 def test_what_is_no_road_is_refused_with_a_reason(texture, monkeypatch):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(0)
     noise = [Frame(k, 0.0, rng.integers(0, 255, (188, 620, 3), np.uint8)) for k in range(2)]
-    failure = RoadHomography(CONFIG, CAMERA).measure(*noise, step)
+    failure = RoadHomography(CAMERA).measure(*noise, step)
     assert isinstance(failure, MeasurementFailure) and "do not correlate" in failure.reason
     sky = Intrinsics(620, 188, 360.0, 360.0, 303.0, 180.0)
-    failure = RoadHomography(CONFIG, sky).measure(*noise, step)
+    failure = RoadHomography(sky).measure(*noise, step)
     assert isinstance(failure, MeasurementFailure) and "too little of the road" in failure.reason
     monkeypatch.setattr(road_homography, "_MAX_TILT_DEG", 0.01)
     monkeypatch.setattr(road_homography, "_TILT_SIGMA_DEG", 5.0)
@@ -133,9 +131,9 @@ def test_a_camera_that_looks_down_learns_its_pitch(texture):
     T_step = se3.invert(T_body_camera) @ se3.make(np.eye(3), np.array([0.0, 0.0, 1.0])) @ T_body_camera
     frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])) @ T_body_camera, texture, k) for k in range(3)]
     level = se3.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
-    road = RoadHomography(CONFIG, CAMERA)
+    road = RoadHomography(CAMERA)
     road.measure(frames[0], frames[1], T_step)
     learned = road.measure(frames[1], frames[2], level)
-    without = RoadHomography(CONFIG, CAMERA).measure(frames[1], frames[2], level)
+    without = RoadHomography(CAMERA).measure(frames[1], frames[2], level)
     assert isinstance(learned, RoadStep)
     assert not isinstance(without, RoadStep) or without.length_heights != learned.length_heights

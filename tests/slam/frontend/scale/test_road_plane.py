@@ -7,7 +7,6 @@ import re
 import numpy as np
 import pytest
 
-from slam.config.sections import ScaleConfig
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
@@ -15,12 +14,11 @@ from slam.frontend.scale.scale_estimate import ScaleEstimate, scale_from_road
 from slam.frontend.visual.depth_error import DepthError
 
 CAMERA = Intrinsics(416, 128, 240.0, 240.0, 207.5, 63.5)
-CONFIG = ScaleConfig()
 HEIGHT = 0.37
 
 
 def fit_ground_plane(depth: DepthMap, seed: int = 0) -> GroundPlane | MeasurementFailure:
-    return GroundPlaneFitter(CONFIG, CAMERA, seed).fit(depth, DepthError())
+    return GroundPlaneFitter(CAMERA, seed).fit(depth, DepthError())
 
 
 def road_depth(height: float = HEIGHT, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> np.ndarray:

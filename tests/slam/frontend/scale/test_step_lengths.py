@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
+import pytest
 
-from slam.config.sections import LengthConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.scale.step_lengths import StepEvidence, gather_evidence, marginals, solve_lengths
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import from_rotation_vector
 
-CONFIG = LengthConfig()
 STEPS = 200
 RATIO_WIDENING, CORRELATED_WIDENING = 1.5, 1.5  # of the sigmas of ratios, and of those in the pose graph
 TRUE = 1.0 + 0.3 * np.sin(np.arange(STEPS) / 15.0)
@@ -42,15 +41,15 @@ def test_triangulation_propagates_rare_road_lengths_through_the_drive():
     measured = evidence(
         absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.05) + np.log(2.0), **ratios(0.003)
     )
-    solved = solve_lengths(measured, CONFIG)
+    solved = solve_lengths(measured)
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
     np.testing.assert_allclose(solved.unit_correction, 0.5, rtol=0.1)
 
 
 def test_a_noisy_road_is_better_with_triangulation_than_without():
     absolute = {"absolute": noisy(0.05), "absolute_sigma": np.full(STEPS, 0.06)}
-    alone = solve_lengths(evidence(**absolute), CONFIG).length
-    together = solve_lengths(evidence(**absolute, **ratios(0.003)), CONFIG).length
+    alone = solve_lengths(evidence(**absolute)).length
+    together = solve_lengths(evidence(**absolute, **ratios(0.003))).length
     errors = [np.sqrt(np.mean(np.log(lengths / TRUE) ** 2)) for lengths in (alone, together)]
     assert errors[0] > 0.03
     assert errors[1] < 0.4 * errors[0]
@@ -60,14 +59,14 @@ def test_a_quarter_of_wrong_roads_does_not_matter():
     road = noisy(0.03)
     road[::4] += np.log(1.6)
     measured = evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), **ratios(0.003))
-    np.testing.assert_allclose(solve_lengths(measured, CONFIG).length, TRUE, rtol=0.05)
+    np.testing.assert_allclose(solve_lengths(measured).length, TRUE, rtol=0.05)
 
 
 def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
     road = noisy(0.03)
     road[: STEPS // 2] += np.log(0.1)
     measured = evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.1, seed=2), **ratios(0.003))
-    solved = solve_lengths(measured.without_contradicted(2.5), CONFIG)
+    solved = solve_lengths(measured.without_contradicted(2.5))
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.08)
     assert np.isfinite(measured.without_contradicted(20.0).absolute).all()
 
@@ -79,20 +78,18 @@ def test_learned_depth_bridges_a_gap_in_the_unit_measured_around_it():
     tied["ratio"] = np.where(gap | np.roll(gap, 1), np.nan, tied["ratio"])
     road = np.where(gap, np.nan, np.log(TRUE))
     learned = np.log(0.7 * TRUE)
-    solved = solve_lengths(
-        evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=learned, **tied), CONFIG
-    )
+    solved = solve_lengths(evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=learned, **tied))
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
-    learned_only = solve_lengths(evidence(learned=learned), CONFIG)
+    learned_only = solve_lengths(evidence(learned=learned))
     np.testing.assert_allclose(learned_only.length, 0.7 * TRUE, rtol=1e-6)
     np.testing.assert_allclose(learned_only.unit_correction, 1.0, atol=1e-6)
 
 
 def test_steps_that_nothing_measured_have_no_length():
     learned = np.where(np.arange(STEPS) < 50, np.nan, np.log(TRUE))
-    solved = solve_lengths(evidence(learned=learned), CONFIG)
+    solved = solve_lengths(evidence(learned=learned))
     assert np.isnan(solved.length[:50]).all() and np.isfinite(solved.length[50:]).all()
-    nothing = solve_lengths(StepEvidence.empty(5), CONFIG)
+    nothing = solve_lengths(StepEvidence.empty(5))
     assert np.isnan(nothing.length).all()
     np.testing.assert_array_equal(nothing.unit_correction, 1.0)
 
@@ -144,8 +141,9 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
     np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
 
 
-def test_correlated_sigmas_are_those_of_sums_of_lengths() -> None:
+def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over 40 steps, independent errors of ``relative_correlated_sigma`` add up as the errors of the lengths do."""
+    monkeypatch.setattr("slam.frontend.scale.step_lengths.OUTLIER_SIGMAS", 1e9)
     middle = slice(80, 120)
     alone, together = [], []
     for seed in range(60):
@@ -158,7 +156,7 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths() -> None:
             ratio=chained,
             ratio_sigma=np.full(STEPS, 0.02 / RATIO_WIDENING),
         )
-        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))
+        solved = solve_lengths(measured)
         summed = np.log(solved.length / TRUE)[middle].sum()
         alone.append(summed / np.linalg.norm(solved.relative_sigma[middle]))
         together.append(CORRELATED_WIDENING * summed / np.linalg.norm(solved.relative_correlated_sigma[middle]))
@@ -166,8 +164,9 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths() -> None:
     assert np.sqrt(np.square(alone).mean()) > 1.5
 
 
-def test_sigmas_are_those_of_the_errors_of_lengths() -> None:
+def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also in the middle of a gap of the road, where there are only triangulation and learned depth."""
+    monkeypatch.setattr("slam.frontend.scale.step_lengths.OUTLIER_SIGMAS", 1e9)
     errors, sigmas = [], []
     for seed in range(20):
         road = noisy(0.06, seed=100 + seed)
@@ -182,7 +181,7 @@ def test_sigmas_are_those_of_the_errors_of_lengths() -> None:
             ratio_sigma=np.full(STEPS, 0.01 / RATIO_WIDENING),
             learned=noisy(0.1, seed=200 + seed),
         )
-        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))
+        solved = solve_lengths(measured)
         errors.append(np.log(solved.length / TRUE))
         sigmas.append(solved.relative_sigma)
     ratio = np.abs(errors) / np.array(sigmas)
@@ -194,7 +193,7 @@ def test_sigmas_are_those_of_the_errors_of_lengths() -> None:
 def test_a_step_that_nothing_measured_has_no_sigma() -> None:
     road = noisy(0.06)
     road[50:60] = np.nan
-    solved = solve_lengths(evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06)), CONFIG)
+    solved = solve_lengths(evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06)))
     np.testing.assert_array_equal(np.isnan(solved.relative_sigma), np.isnan(solved.length))
     assert np.isnan(solved.length[50:60]).all() and np.isfinite(solved.length[:50]).all()
 
@@ -208,14 +207,14 @@ def driven(metres: np.ndarray) -> StepEvidence:
 
 
 def test_a_step_of_half_a_metre_between_metres_is_an_outlier() -> None:
-    solved = solve_lengths(driven(np.where(np.arange(60) == 30, 0.5, 1.0)), CONFIG)
+    solved = solve_lengths(driven(np.where(np.arange(60) == 30, 0.5, 1.0)))
     assert np.flatnonzero(solved.contradicted).tolist() == [30]
     np.testing.assert_allclose(solved.length, 1.0, rtol=0.1)
 
 
 def test_a_stretch_of_half_metres_is_said() -> None:
     """Learned depth alone cannot be overruled for ten steps, but no vehicle changes its speed so."""
-    solved = solve_lengths(driven(np.where((np.arange(60) >= 30) & (np.arange(60) < 40), 0.5, 1.0)), CONFIG)
+    solved = solve_lengths(driven(np.where((np.arange(60) >= 30) & (np.arange(60) < 40), 0.5, 1.0)))
     said = np.flatnonzero(solved.contradicted)
     assert len(said) and set(said) <= set(range(28, 43))
 
@@ -223,6 +222,6 @@ def test_a_stretch_of_half_metres_is_said() -> None:
 def test_a_car_may_brake() -> None:
     """From 20 m/s at 8 m/s2 to 1 m/s."""
     metres = 0.1 * np.maximum(20.0 - 0.8 * np.arange(30), 1.0)
-    solved = solve_lengths(driven(metres), CONFIG)
+    solved = solve_lengths(driven(metres))
     assert not solved.contradicted.any()
     np.testing.assert_allclose(solved.length[1:-1], metres[1:-1], rtol=0.1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.epipolar import UnitRelativePose, triangulated_nearness
+from slam.geometry.epipolar import UnitRelativePose, triangulated_nearness
 
 NOISE_PX = 0.2
 

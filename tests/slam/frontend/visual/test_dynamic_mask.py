@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.frontend.visual.dynamic_mask import DynamicMask
+from slam.frontend.visual.moving_regions import DynamicMask
 
 CAR = np.array([300.0, 70.0])
 RNG = np.random.default_rng(0)

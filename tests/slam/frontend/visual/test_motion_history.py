@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.motion_history import MotionHistory
+from slam.geometry.epipolar import UnitRelativePose
 
 
 def heading(aside_deg: float) -> UnitRelativePose:

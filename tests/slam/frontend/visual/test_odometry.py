@@ -13,10 +13,10 @@ from slam import frames
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.tracking import CornerTracker
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.step_noise import StepNoise
-from slam.frontend.visual.tracking import CornerTracker
 from slam.geometry import se3
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)

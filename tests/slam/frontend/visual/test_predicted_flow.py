@@ -8,9 +8,9 @@ import pytest
 
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
-from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.visual.predicted_flow import PredictedFlow
-from slam.frontend.visual.tracking import CornerTracker, Tracks
+from slam.geometry.epipolar import UnitRelativePose
 
 CAMERA = Intrinsics(320, 120, 240.0, 240.0, 160.0, 40.0)
 HEIGHT, LENGTH = 1.65, 1.1

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry import se3
+from slam.geometry.epipolar import UnitRelativePose
 
 FOCAL_PX = 240.0
 LENGTH = 0.9

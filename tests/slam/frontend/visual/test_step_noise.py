@@ -1,15 +1,20 @@
-"""Noise of steps by the rotation jitter, the rotation and the neighbours of a drive."""
+"""Noise of steps by the rotation jitter of a drive and by the neighbours of a step."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from slam.config.sections import VisualOdometryConfig
-from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas, neighbour_residual, rotation_jitter
+from slam.frontend.visual.step_noise import (
+    JITTER_DIRECTION,
+    JITTER_ROTATION,
+    NEIGHBOUR_ROTATION,
+    StepNoise,
+    inflate_step_sigmas,
+    neighbour_residual,
+    rotation_jitter,
+)
 from slam.geometry.se3 import from_rotation_vector
-
-CONFIG = VisualOdometryConfig()
 
 
 def own(count: int, sigma_rad: float = 0.0) -> dict[int, StepNoise]:
@@ -59,33 +64,32 @@ def test_the_neighbour_residual_is_large_at_a_jump_and_not_beside_it():
     np.testing.assert_array_equal(neighbour_residual({3: np.ones(3)}, 3), 0.0)
 
 
-def test_sigmas_are_ratios_of_jitter_and_rotation():
+def test_sigmas_are_ratios_of_jitter():
     jittery = turns(np.full(3, 1e-3))
-    noise, jitter = inflate_step_sigmas(steps(jittery), own(400), CONFIG), rotation_jitter(dict(enumerate(jittery)))
+    noise, jitter = inflate_step_sigmas(steps(jittery), own(400)), rotation_jitter(dict(enumerate(jittery)))
     assert noise.keys() == set(range(400))
     smallest = min(noise.values(), key=lambda n: n.direction.sum())
-    assert smallest.direction[0] == pytest.approx(CONFIG.jitter_direction_ratio * np.linalg.norm(jitter), rel=0.1)
+    assert smallest.direction[0] == pytest.approx(JITTER_DIRECTION * np.linalg.norm(jitter), rel=0.1)
     assert smallest.direction[2] < 0.1 * smallest.direction[0], "an error along the motion is one of length"
     for step in noise.values():
-        assert (step.rotation >= CONFIG.jitter_rotation_ratio * jitter).all()
+        assert (step.rotation >= JITTER_ROTATION * jitter).all()
 
 
-def test_sharp_turns_and_jumps_widen_their_own_steps():
+def test_a_jump_widens_its_own_step():
     smooth = np.zeros((60, 3))
     smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 25.0) ** 2
     jumping = smooth.copy()
     jumping[30, 0] += np.deg2rad(1.0)
-    before, after = (inflate_step_sigmas(steps(drive), own(60), CONFIG) for drive in (smooth, jumping))
-    assert before[39].rotation[1] == pytest.approx(CONFIG.turn_rotation_ratio * smooth[39, 1], rel=0.1)
-    assert after[30].rotation[0] == pytest.approx(CONFIG.neighbour_rotation_ratio * np.deg2rad(1.0), rel=0.1)
+    before, after = (inflate_step_sigmas(steps(drive), own(60)) for drive in (smooth, jumping))
+    assert after[30].rotation[0] == pytest.approx(NEIGHBOUR_ROTATION * np.deg2rad(1.0), rel=0.1)
     np.testing.assert_allclose(after[10].rotation, before[10].rotation, atol=1e-6)
 
 
 def test_noise_explained_by_corners_is_not_counted_twice():
     jittery = steps(turns(np.full(3, 1e-3)))
-    alone, known = (inflate_step_sigmas(jittery, own(400, sigma), CONFIG) for sigma in (0.0, 1.5e-3))
+    alone, known = (inflate_step_sigmas(jittery, own(400, sigma)) for sigma in (0.0, 1.5e-3))
     pitch = [step.rotation[0] for step in known.values()]
     assert np.median(pitch) < 0.03e-3, "white noise of the corners' own size is no jitter"
     assert all((known[k].rotation <= alone[k].rotation).all() for k in alone)
     assert all((known[k].direction <= alone[k].direction).all() for k in alone)
-    assert inflate_step_sigmas({}, {}, CONFIG) == {}
+    assert inflate_step_sigmas({}, {}) == {}

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.frontend.visual.triangulated_points import TriangulatedPoints
+from slam.frontend.visual.step_check import TriangulatedPoints
 
 
 def triangulated(track_ids: np.ndarray, previous: np.ndarray, current: np.ndarray) -> TriangulatedPoints:

@@ -10,12 +10,12 @@ import pytest
 
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
-from slam.frontend.visual.epipolar import UnitRelativePose, unit_pose_by_essential
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, TwoViewEstimator
 from slam.geometry import se3
+from slam.geometry.epipolar import UnitRelativePose, unit_pose_by_essential
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 

@@ -53,7 +53,7 @@ def changed(report: Path, name: str, extra: str) -> Path:
 def test_every_plot_is_drawn_and_nothing_offers_to_send_it(report: Path) -> None:
     page, console = browse(report, "--dump-dom")
     assert console == []
-    assert page.count('class="plot"') == page.count('class="modebar-container"') == 6
+    assert page.count('class="plot"') == page.count('class="modebar-container"') == 5
     titles = set(re.findall('data-title="([^"]*)"', page))
     of_map = {"Orbital rotation", "Reset camera to default"}
     assert titles == {"Zoom", "Pan", "Reset axes", "Download plot as a PNG"} | of_map

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry.se3 import from_rotation_vector, invert
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import Loop
+from slam.loops.verification import Loop, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
+from slam.results.report.page import Picture
 from slam.results.report.pictures import DepthPictures, loop_pictures
-from slam.results.report.rendering import Picture
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

@@ -38,5 +38,5 @@ def test_a_file_that_was_cut_short_is_an_error_and_no_garbage() -> None:
     spill_file = SpillFile()
     kept = spill_file.put(np.ones((100, 100)))
     spill_file._file.truncate(5000)
-    with pytest.raises(SlamError, match="cut short \\(5000 of 80000 bytes\\)"):
+    with pytest.raises(SlamError, match=r"cannot be read .*: run again"):
         kept.read()

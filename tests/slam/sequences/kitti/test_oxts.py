@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from slam.sequences.kitti import oxts
+from slam.sequences import kitti as oxts
 
 
 def packet(**columns: float) -> np.ndarray:

@@ -1,0 +1,315 @@
+"""Many drives, of a manifest or of a data set, each in a process of its own, and one table of how they ended."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+import shlex
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from erfsfm.common.files import is_foreign, read_text
+from erfsfm.common.processes import slam_process
+from erfsfm.common.progress import Progress
+from erfsfm.common.readers.frame_range import EVERYTHING
+from erfsfm.common.table import Table, csv_of
+from erfsfm.inference import record_of_whole_weights
+from slam.commands.cluster import workers
+from slam.config.sections import load_config
+from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics
+from slam.results.tables import written
+from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.runtime.storage.files import from_anywhere, write_atomically
+from slam.sequences.catalogue import sequence_names
+from slam.sequences.excerpt import frame_range
+
+CSV = "drives.csv"
+_MANIFEST = ".csv"
+_KEYS = ("name", "dataset", "sequence", "camera", "options")
+_OURS = ("--dataset", "--sequence", "-s", "--camera", "--output", "--json")
+_LOG_BEGIN = "erfsfm-slam run "  # a log begins with the command
+_FIRST = ("drive", "status", "reason")
+# columns of drives.csv, and their decimals on a terminal, which shows those that have some
+_COLUMNS: dict[str, tuple[Callable[[Metrics], object], int | None]] = {
+    "sequence": (lambda m: m.sequence.name, None),
+    "frames": (lambda m: m.sequence.frames, 0),
+    "length_m": (lambda m: m.sequence.length_m, 0),
+    "scale": (lambda m: m.scale.mode, None),
+    "unit": (lambda m: m.unit, 0),
+    "ate_6dof_m": (lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else None, 3),
+    "ate_7dof_m": (lambda m: m.trajectories.optimised.align.dof7.ate_rmse_m, 3),
+    "t_rel_percent": (lambda m: m.trajectories.optimised.align.dof7.t_rel_percent, 2),
+    "r_rel_deg_per_100m": (lambda m: m.trajectories.optimised.align.dof7.r_rel_deg_per_100m, None),
+    "interpolated_frames": (lambda m: m.sequence.bridged_frames, None),
+    "loops": (lambda m: m.loops.accepted, None),
+    "map_triangles": (lambda m: m.map.triangles, None),
+    "leak": (lambda m: m.provenance.leak, None),
+    "seconds": (lambda m: m.timing.seconds_total, 1),
+    "frames_per_second": (lambda m: m.timing.frames_per_second, None),
+    "peak_rss_mb": (lambda m: m.timing.peak_rss_mb, None),
+}
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One run: ``name`` of its folder, and ``arguments`` of ``erfsfm-slam run`` without ``--output``.
+
+    Relative paths are seen from ``folder``.
+    """
+
+    name: str
+    folder: Path
+    arguments: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a drive ended: its run is whole, or was whole before and kept, or failed with a reason."""
+
+    drive: Drive
+    folder: Path
+    status: Literal["whole", "kept", "failed"]
+    reason: str = ""
+
+
+def options_of_drives(
+    weights: str | None, config: str | None, overrides: Iterable[str], frames: str | None, seed: int, device: str
+) -> list[str]:
+    """Options of ``run`` for all drives, with paths that hold in the folder of each."""
+    words = []
+    for override in overrides:
+        kind, colon, path = override.partition(":")
+        is_path = kind.startswith("depth.source=") and bool(colon)
+        words += ["--set", f"{kind}:{from_anywhere(path)}" if is_path else override]
+    if weights is not None:
+        words += ["--weights", from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights]
+    if config is not None:
+        words += ["--config", from_anywhere(config) if Path(config).is_file() else config]
+    if frames is not None:
+        words += ["--frames", frames]
+    return [*words, "--seed", str(seed), "--device", device]
+
+
+def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
+    """The drives of a manifest, or the named sequences of a data set; their options are checked.
+
+    Args:
+        manifest_or_root: a ``.csv`` file, or a data set.
+        sequences: names in the data set; ``all`` is every one.
+        options: of ``run``, for all drives; those of a manifest come after them.
+
+    Raises:
+        SlamError, ErfsfmError: no such file or sequences, or an entry or option that is not understood.
+    """
+    is_manifest = manifest_or_root.suffix.lower() == _MANIFEST
+    if is_manifest and manifest_or_root.is_file():
+        if list(sequences) != ["all"]:
+            raise SequenceError(f"{manifest_or_root} names its sequences itself: leave out --sequence")
+        drives = _manifest(manifest_or_root, options)
+    elif is_manifest and not manifest_or_root.exists():
+        raise SequenceError(f"no manifest {manifest_or_root}: check the path")
+    else:
+        drives = _of_data_set(manifest_or_root, sequences, options)
+    for drive in drives:
+        _require_known(drive)
+    return drives
+
+
+def run_drives(
+    drives: Sequence[Drive],
+    output: Path,
+    count: int,
+    scheduler: str | None,
+    progress: Progress,
+    threads: int | None = None,
+    memory_gib: float = 0.0,
+) -> list[Outcome]:
+    """Run the drives that are not whole in ``output``, and write ``drives.csv``; one outcome a drive, in their order.
+
+    Args:
+        drives: to run.
+        output: folder of their run folders.
+        count: drives at a time on this machine.
+        scheduler: address of a Dask scheduler in place of this machine.
+        progress: called with (stage, done, total).
+        threads: of a drive; None for the cores of this machine by the workers.
+        memory_gib: that a drive may use; 0 for all.
+
+    Raises:
+        SlamError: a folder with files of others, or no such scheduler.
+    """
+    check_output(output, drives)
+    output.mkdir(parents=True, exist_ok=True)
+    threads = threads or (0 if scheduler else max((os.cpu_count() or 1) // count, 1))
+    work = partial(run_drive, output=output.absolute(), threads=threads, memory_gib=memory_gib)
+    outcomes: dict[int, Outcome] = {}
+    progress("drives", 0, len(drives))
+    with workers(min(count, len(drives)), scheduler) as spread:
+        for number, result in spread(work, drives):
+            drive = drives[number]
+            if not isinstance(result, Outcome):
+                reason = " ".join(f"{type(result).__name__}: {result}".split())
+                result = Outcome(drive, output / drive.name, "failed", reason)
+            outcomes[number] = result
+            progress("drives", len(outcomes), len(drives))
+    ordered = [outcomes[number] for number in range(len(drives))]
+    _write_summary(output, ordered)
+    return ordered
+
+
+def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 0.0) -> Outcome:
+    """Run one drive to ``output/<name>``, unless the same command left a whole run there."""
+    folder = output / drive.name
+    arguments = ["run", *drive.arguments, "--output", str(folder)]
+    if _is_whole(folder, arguments):
+        return Outcome(drive, folder, "kept")
+    output.mkdir(parents=True, exist_ok=True)
+    log = output / f"{drive.name}.log"
+    log.write_text(shlex.join(["erfsfm-slam", *arguments]) + "\n", encoding="utf-8")
+    program = ("slam.commands.batch_process", str(output / f".{drive.name}.lock"))
+    reason = slam_process(arguments, drive.folder, log, threads, memory_gib, program)
+    if not reason and not _is_whole(folder, arguments):
+        reason = "it ended well and left no whole run: leave out options that only ask something"
+    return Outcome(drive, folder, "failed" if reason else "whole", reason)
+
+
+def check_output(output: Path, drives: Sequence[Drive]) -> None:
+    """Check that a batch of these drives may be written to a folder.
+
+    Raises:
+        RunError: a file, or a folder of other files with the names of a summary or of a log.
+    """
+    if output.exists() and not output.is_dir():
+        raise RunError(f"{output} is a file: give a folder as --output")
+    if CSV in {drive.name for drive in drives}:
+        raise RunError(f"a drive is named {CSV}, as a file of the batch: give it another name in the manifest")
+    logs = {f"{drive.name}.log": _LOG_BEGIN for drive in drives}
+    for name, mark in ({CSV: ",".join(_FIRST)} | logs).items():
+        if is_foreign(output / name, mark):
+            raise RunError(f"{output / name} is none of ours and would be replaced: choose another --output")
+
+
+def summary_table(outcomes: Sequence[Outcome]) -> Table:
+    """The main numbers of the runs that are whole, and why others failed."""
+    shown = {name: decimals for name, (_, decimals) in _COLUMNS.items() if decimals is not None}
+    rows = [
+        [row["drive"], row["status"], *(written(row[name], decimals) for name, decimals in shown.items())]
+        for row in map(_row, outcomes)
+        if row["status"] != "failed"
+    ]
+    notes = [f"{outcome.drive.name} failed: {outcome.reason}" for outcome in outcomes if outcome.status == "failed"]
+    return Table(["drive", "status", *(name.replace("_", "\n", 1) for name in shown)], rows, notes=notes)
+
+
+def _of_data_set(root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
+    names = sequence_names(root)
+    if not names:
+        raise SequenceError(f"{root} is no manifest ({_MANIFEST}) and holds no sequences")
+    missing = [name for name in sequences if name != "all" and name not in names]
+    if missing:
+        raise SequenceError(f"{root} has no sequence {missing[0]}: it has {', '.join(names)}")
+    root = root.absolute() if root.exists() else root  # KITTI may be named by the environment alone
+    return _named(
+        Drive(name, root.absolute().parent, ("--dataset", str(root), "--sequence", name, *options))
+        for name in (names if "all" in sequences else sequences)
+    )
+
+
+def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
+    try:
+        lines = io.StringIO(read_text(path), newline="")
+        rows = [
+            {key: word for key, word in row.items() if word} for row in csv.DictReader(lines, skipinitialspace=True)
+        ]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SequenceError(f"the manifest {path} cannot be read: {getattr(error, 'strerror', error)}") from error
+    if not rows:
+        raise SequenceError(f"{path} names no drive: give rows of {', '.join(_KEYS)}")
+    given = [row["name"] for row in rows if "name" in row]
+    twice = next((name for name in given if given.count(name) > 1), None)
+    if twice is not None:
+        raise SequenceError(f"{path}: two drives are named {twice}: choose other names")
+    return _named(_drive(row, path, f"{path}, drive {number}", options) for number, row in enumerate(rows, 1))
+
+
+def _drive(row: dict[str, str], path: Path, where: str, options: Sequence[str]) -> Drive:
+    unknown = [str(key) for key in row if key not in _KEYS]
+    if unknown or "dataset" not in row:
+        problem = f"{unknown[0]!r} is no key" if unknown else "dataset is missing"
+        raise SequenceError(f"{where}: {problem}; the keys are {', '.join(_KEYS)}")
+    try:
+        own = shlex.split(row.get("options", ""))
+    except ValueError as error:
+        raise SequenceError(
+            f"{where}: options are not understood ({error}): write them as on a command line"
+        ) from error
+    taken = [word for word in own if word.partition("=")[0] in _OURS]
+    if taken:
+        raise SequenceError(
+            f"{where}: {taken[0]} is no option of a drive: use the keys, the folder is given by the batch"
+        )
+    named = [word for key in ("dataset", "sequence", "camera") if key in row for word in (f"--{key}", row[key])]
+    name = row.get("name") or row.get("sequence") or Path(row["dataset"]).stem
+    return Drive(name, path.absolute().parent, (*named, *options, *own))
+
+
+def _named(drives: Iterable[Drive]) -> list[Drive]:
+    """Drives with names for folders; a repeated one is numbered."""
+    found: dict[str, Drive] = {}
+    for drive in drives:
+        name = re.sub(r"[^\w.-]+", "-", drive.name).strip("-.") or "drive"
+        number, unique = 1, name
+        while unique in found:
+            number += 1
+            unique = f"{name}-{number}"
+        found[unique] = replace(drive, name=unique)
+    return list(found.values())
+
+
+def _require_known(drive: Drive) -> None:
+    """Check what can be wrong in the options of a drive whatever its recording holds.
+
+    Raises:
+        SlamError, ErfsfmError: one line.
+    """
+    given: dict[str, list[str]] = {}
+    for word, following in zip(drive.arguments, (*drive.arguments[1:], "")):
+        option, equals, value = word.partition("=")
+        given.setdefault(option, []).append(value if equals else following)
+
+    def last(option: str, default: str | None = None) -> str | None:
+        value = given.get(option, [default])[-1]
+        return str(drive.folder / value) if value and (drive.folder / value).exists() else value
+
+    load_config(last("--config"), given.get("--set", ()))
+    if (frames := last("--frames")) is not None:
+        frame_range(frames, EVERYTHING)
+    record_of_whole_weights(last("--weights", "default") or "")
+
+
+def _is_whole(folder: Path, arguments: list[str]) -> bool:
+    """Whether a folder holds the whole run of this command."""
+    try:
+        metrics = RunFolder(folder).metrics()
+    except SlamError:
+        return False
+    return metrics.status == "ok" and metrics.provenance.command == shlex.join(["erfsfm-slam", *arguments])
+
+
+def _write_summary(output: Path, outcomes: Sequence[Outcome]) -> None:
+    content = csv_of(map(_row, outcomes))
+    write_atomically(output / CSV, lambda path: path.write_text(content, encoding="utf-8", newline=""), RunError)
+
+
+def _row(outcome: Outcome) -> dict[str, Any]:
+    row: dict[str, Any] = {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
+    if outcome.status == "failed":
+        return row | dict.fromkeys(_COLUMNS)
+    metrics = RunFolder(outcome.folder).metrics()
+    return row | {name: value(metrics) for name, (value, _) in _COLUMNS.items()}

@@ -1,1 +1,0 @@
-"""Many drives at once, each in a process of its own, on one machine or a cluster."""

@@ -1,0 +1,314 @@
+"""A camera from images of a board: ``camera.yaml`` and a picture of the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.figure_file import require_figure, save_figure
+from erfsfm.common.progress import Progress
+from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
+from erfsfm.common.readers.folder import image_folder
+from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.numbering import in_order
+from erfsfm.common.readers.video import VideoFrames
+from slam.commands.board import FEWEST_VIEWS, Board, View, chosen_views, find_views
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import CalibrationError, sequence_errors
+from slam.runtime.storage.files import write_atomically
+from slam.sequences.camera_file import DEFAULT_FPS
+from slam.sequences.images import ImageFiles, ImageSource
+from slam.sequences.undistortion import Undistortion
+
+Model = Literal["opencv", "fisheye"]
+
+_FLAGS_HOME = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # before OpenCV 5
+_FISHEYE_FLAGS = _FLAGS_HOME.CALIB_RECOMPUTE_EXTRINSIC | _FLAGS_HOME.CALIB_FIX_SKEW
+_OUTLIER = 3.0  # times the median error of a view
+_GAIN = 0.98  # of the error, below which the sixth power of the radius is worth a coefficient
+_MOST_ERROR_PX = 1.0  # for images 640 pixels wide
+_MOST_FOCAL_SIGMA = 0.005  # of the focal length
+_LEAST_TILT_DEG = 10.0
+_LEAST_COVERED = 0.3  # of the image
+_WELL_COVERED = 0.6
+_MARK = "erfsfm-slam calibrate"  # of a camera file that was calibrated
+_SIZE_INCHES, _DPI = (13.0, 5.0), 100
+_ARROW_LENGTH = 0.05  # of the image's width, of an error as large as the root mean square
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A camera and how well it fits.
+
+    Attributes:
+        model: of the lens.
+        width, height: of the images, pixels.
+        K: the camera matrix ``(3, 3)``.
+        distortion: k1 k2 p1 p2 k3, or k1 k2 k3 k4 of a fisheye.
+        views: those used.
+        residuals: for each of them, corners found less corners projected ``(N, 2)``, pixels.
+        T_camera_board: poses of the board ``(V, 4, 4)``.
+        focal_sigma: standard deviation of the focal length over itself, for errors that are independent.
+    """
+
+    model: Model
+    width: int
+    height: int
+    K: FloatArray
+    distortion: FloatArray
+    views: list[View]
+    residuals: list[FloatArray]
+    T_camera_board: FloatArray
+    focal_sigma: float
+
+    @property
+    def error_px(self) -> float:
+        """Root mean square of the distances between corners found and projected."""
+        return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in self.residuals]))))
+
+    @property
+    def errors_px(self) -> FloatArray:
+        """The same of each view ``(V,)``."""
+        return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in self.residuals])
+
+    @property
+    def tilts_deg(self) -> FloatArray:
+        """Angle between the board and the image plane in each view ``(V,)``."""
+        return np.asarray(np.rad2deg(np.arccos(np.clip(np.abs(self.T_camera_board[:, 2, 2]), 0, 1))))
+
+    @property
+    def covered(self) -> float:
+        """Share of the image inside the convex hull of all corners."""
+        hull = cv2.convexHull(np.concatenate([view.pixels for view in self.views]).astype(np.float32))
+        return float(cv2.contourArea(hull)) / (self.width * self.height)
+
+
+@sequence_errors()
+def calibrate_camera(
+    recording: Path, board: Board, model: Model, output: Path, fps: float | None, progress: Progress
+) -> list[str]:
+    """Calibrate a camera from a video or a folder of images of a board.
+
+    Args:
+        recording: a video, or a folder of images of one size.
+        board: the board.
+        model: of the lens.
+        output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``, or among
+            images, where it would be one of them, as ``camera.pdf``.
+        fps: to write; None for the rate of the video, or 10.
+        progress: called with (stage, done, total).
+
+    Returns:
+        What was found, in lines for the user.
+
+    Raises:
+        CalibrationError: the images do not give a camera; nothing is written.
+        SequenceError: the images cannot be read.
+    """
+    if output.suffix not in (".yaml", ".yml"):
+        raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
+    picture = output.with_suffix(".pdf" if _among_images(output) else ".png")
+    _refuse_other_kind(output, picture)
+    require_figure(picture)
+    images, own_fps = _open(recording)
+    views = chosen_views(find_views(images, board, progress))
+    fit = fit_camera(views, images.width, images.height, model)
+    source = f"{_MARK}: {len(fit.views)} views of a {board.describe()}, reprojection error {fit.error_px:.3f} pixels"
+    camera = CameraFile(
+        width=fit.width,
+        height=fit.height,
+        fx=_rounded(fit.K[0, 0]),
+        fy=_rounded(fit.K[1, 1]),
+        cx=_rounded(fit.K[0, 2]),
+        cy=_rounded(fit.K[1, 2]),
+        fps=fps or _rounded(own_fps or DEFAULT_FPS),
+        camera_height_m="unknown",
+        model=model,
+        distortion=tuple(_rounded(value) for value in fit.distortion),
+        source=source,
+    )
+    Undistortion(camera)  # refuses a lens that cannot be undistorted
+    text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
+    write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"), CalibrationError)
+    _write_picture(picture, fit, camera, images)
+    lines = [
+        f"fx {camera.fx:g}, fy {camera.fy:g} ± {100 * fit.focal_sigma:.2f} %, cx {camera.cx:g}, cy {camera.cy:g}, "
+        f"{model} {list(camera.distortion)}",
+        f"{len(fit.views)} views, tilts to {fit.tilts_deg.max():.0f} degrees, {100 * fit.covered:.0f} % of the image; "
+        f"reprojection error {fit.error_px:.3f} pixels, worst view {fit.errors_px.max():.3f}",
+    ]
+    if fit.covered < _WELL_COVERED:
+        lines.append("corners fill little of the image: show the board at its borders, where the lens is less certain")
+    if fps is None and recording.is_dir():
+        lines.append(f"fps {camera.fps:g} is assumed: images have no rate; give --fps, or correct it in the file")
+    return [*lines, f"camera in {output}, its fit drawn in {picture}"]
+
+
+def fit_camera(views: list[View], width: int, height: int, model: Model) -> Calibration:
+    """Fit a camera to views of a board; views that fit three times worse than the median are left out.
+
+    Raises:
+        CalibrationError: the views do not determine the camera, or no camera explains them.
+    """
+    found = _fit(views, width, height, model)
+    good = found.errors_px <= _OUTLIER * np.median(found.errors_px)
+    if not good.all():
+        found = _fit([view for view, is_good in zip(views, good, strict=True) if is_good], width, height, model)
+    _require_determined(found)
+    return found
+
+
+def _fit(views: list[View], width: int, height: int, model: Model) -> Calibration:
+    if len(views) < FEWEST_VIEWS:
+        raise CalibrationError(f"{len(views)} sharp views fit one camera, {FEWEST_VIEWS} are needed: take more images")
+    try:
+        if model == "fisheye":
+            return _fit_fisheye(views, width, height)
+        plain = _fit_opencv(views, width, height, cv2.CALIB_FIX_K3)
+        bent = _fit_opencv(views, width, height, 0)
+    except cv2.error as error:
+        reason = " ".join(str(error.err or error).split())
+        raise CalibrationError(
+            f"OpenCV finds no {model} camera for these views ({reason}): show the board at more places and tilts"
+        ) from error
+    return bent if bent.error_px < _GAIN * plain.error_px else plain
+
+
+def _fit_opencv(views: list[View], width: int, height: int, flags: int) -> Calibration:
+    corners = [view.corners_m.astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    _, K, distortion, turns, places = cv2.calibrateCamera(corners, pixels, (width, height), None, None, flags=flags)
+    return _calibration("opencv", views, (width, height), K, distortion.ravel()[:5], turns, places)
+
+
+def _fit_fisheye(views: list[View], width: int, height: int) -> Calibration:
+    corners, pixels = [view.corners_m[None] for view in views], [view.pixels[None] for view in views]
+    K, distortion = np.zeros((3, 3)), np.zeros((4, 1))
+    _, K, distortion, turns, places = cv2.fisheye.calibrate(
+        corners, pixels, (width, height), K, distortion, flags=_FISHEYE_FLAGS
+    )
+    return _calibration("fisheye", views, (width, height), K, distortion.ravel(), turns, places)
+
+
+def _calibration(
+    model: Model,
+    views: list[View],
+    size: tuple[int, int],
+    K: FloatArray,
+    distortion: FloatArray,
+    turns: Any,
+    places: Any,
+) -> Calibration:
+    """Residuals of a camera, and how sure its focal length is by the normal equations with the poses eliminated."""
+    count = 4 + len(distortion)
+    residuals, information = [], np.zeros((count, count))
+    T_camera_board = np.tile(np.eye(4), (len(views), 1, 1))
+    for T, view, turn, place in zip(T_camera_board, views, turns, places, strict=True):
+        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(np.ravel(turn)).as_matrix(), np.ravel(place)
+        if model == "fisheye":
+            pixels, J = cv2.fisheye.projectPoints(view.corners_m[:, None], turn, place, K, distortion)
+            of_camera, of_pose = J[:, :count], J[:, count : count + 6]
+        else:
+            pixels, J = cv2.projectPoints(view.corners_m[:, None], turn, place, K, distortion)
+            of_camera, of_pose = J[:, 6 : 6 + count], J[:, :6]
+        residuals.append(view.pixels - np.asarray(pixels, np.float64).reshape(-1, 2))
+        information += of_camera.T @ (of_camera - of_pose @ np.linalg.lstsq(of_pose, of_camera, rcond=None)[0])
+    freedom = sum(residual.size for residual in residuals) - count - 6 * len(views)
+    variance = sum(float((residual**2).sum()) for residual in residuals) / max(freedom, 1)
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    covariance = (
+        variance * np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+    )
+    sigma = float(np.sqrt(max(covariance[:2, :2].mean(), 0.0))) / (0.5 * (K[0, 0] + K[1, 1]))
+    return Calibration(model, *size, np.asarray(K), distortion, views, residuals, T_camera_board, sigma)
+
+
+def _require_determined(fit: Calibration) -> None:
+    """Refuse a camera that the views do not determine.
+
+    Raises:
+        CalibrationError: with what to do.
+    """
+    advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
+    steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
+    faults = {
+        f"all {len(fit.views)} views are frontal (tilts under {steepest:.0f} degrees): they do not determine the focal "
+        f"length; {advice}": steepest < _LEAST_TILT_DEG,
+        f"the reprojection error is {fit.error_px:.2f} pixels, {most_error:.1f} at most: is the board flat, --board "
+        f"right, and --model {fit.model} that of the lens?": fit.error_px > most_error,
+        f"the views leave the focal length uncertain by {100 * fit.focal_sigma:.1f} %, at most "
+        f"{100 * _MOST_FOCAL_SIGMA:.1f} %: {advice}": not fit.focal_sigma <= _MOST_FOCAL_SIGMA,
+        f"the board was seen in {100 * fit.covered:.0f} % of the image alone, {100 * _LEAST_COVERED:.0f} % at least: "
+        f"the lens is not determined elsewhere; {advice}": fit.covered < _LEAST_COVERED,
+    }
+    for words, is_fault in faults.items():
+        if is_fault:
+            raise CalibrationError(words)
+
+
+def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: ImageSource) -> None:
+    """Draw a fit: the sharpest image with all corners and the residuals of its own, and the image undistorted."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=_SIZE_INCHES, dpi=_DPI, layout="constrained")
+    before, after = figure.subplots(1, 2)
+    view = int(np.argmax([each.sharpness for each in fit.views]))
+    image = images.read(fit.views[view].frame)
+    longer = _ARROW_LENGTH * fit.width / max(fit.error_px, 1e-9)
+    before.imshow(image)
+    before.plot(*np.concatenate([each.pixels for each in fit.views]).T, ".", color="#e69f00", markersize=2)
+    u, v = fit.views[view].pixels.T
+    du, dv = longer * fit.residuals[view].T
+    before.quiver(u, v, du, dv, angles="xy", scale_units="xy", scale=1.0, color="#d55e00", width=0.003)
+    before.set_title(
+        f"corners of {len(fit.views)} views; residuals of image {fit.views[view].frame}, {longer:.0f} times"
+    )
+    after.imshow(Undistortion(camera).apply(image) if camera.is_distorted else image)
+    after.set_title(f"image {fit.views[view].frame} undistorted: edges of the board must be straight")
+    for axis in (before, after):
+        axis.set_axis_off()
+    save_figure(figure, path, _DPI)
+
+
+def _refuse_other_kind(output: Path, picture: Path) -> None:
+    """A picture is replaced beside a camera file that was calibrated."""
+    if output.is_dir():
+        raise CalibrationError(f"--output {output} is a folder: give the name of a file to write")
+    source = None
+    if output.is_file() and output.stat().st_size:
+        try:
+            source = read_camera_file(output).source
+        except DataError as error:
+            raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
+    if picture.exists() and not (source or "").startswith(_MARK):
+        raise CalibrationError(f"{picture} exists and is of no earlier calibration: choose another --output")
+
+
+def _among_images(output: Path) -> bool:
+    """Whether the folder of the output holds images, other than a picture of an earlier calibration."""
+    return any(path.stem != output.stem for path in list_images(output.parent))
+
+
+def _open(recording: Path) -> tuple[ImageSource, float | None]:
+    """The images, and their rate where they are a video."""
+    if not recording.exists():
+        raise DataError(f"no video or folder at {recording}: check the path")
+    if recording.is_file():
+        video = VideoFrames(recording)
+        return video, video.fps
+    folder = image_folder(recording)
+    if folder is None:
+        raise DataError(f"no images in {recording}: give a folder of png, jpg or bmp images, or a video")
+    return ImageFiles(in_order(list_images(folder))), None
+
+
+def _rounded(value: float) -> float:
+    """Six digits: far below what a calibration determines."""
+    return float(np.format_float_positional(value, precision=6, fractional=False))

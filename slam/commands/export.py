@@ -1,0 +1,163 @@
+"""Parts of a run as files for other programs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from erfsfm.common.progress import Progress, silent
+from slam.commands.occupancy import occupancy_grid
+from slam.commands.scenes import POINTS, write_model, write_scene
+from slam.formats.colmap import BINARY_FOLDER, MODEL_FILES, is_own_model
+from slam.formats.ply import Ply, read_ply, rotated, write_ply
+from slam.formats.ros_map import describes_map, write_ros_map
+from slam.formats.trajectory import Trajectory
+from slam.formats.transforms import TRANSFORMS, is_own_scene
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.results.folder import RunFolder
+from slam.results.metrics import CAMERA_HEIGHTS, METRES
+from slam.results.output_file import check_replaced
+from slam.runtime.errors import RunError
+from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
+
+# from a camera's x right, y down, z ahead
+R_UP_WORLDS: dict[str, FloatArray] = {
+    "y-down": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # x right, y ahead, z up
+}
+_OPTIONS: dict[str, tuple[str, ...]] = {
+    "mesh": (),
+    "cloud": (),
+    "colmap": ("dataset", "points"),
+    "nerfstudio": ("dataset",),
+    "occupancy": ("resolution",),
+}
+_MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
+_SCENES = {
+    "colmap": ("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), is_own_model),
+    "nerfstudio": ("a scene", ("images", POINTS, TRANSFORMS), is_own_scene),
+}
+_RESOLUTION = 0.1  # of an occupancy grid
+
+
+def export(
+    folder: RunFolder,
+    what: str,
+    output: Path,
+    up: str = "y-down",
+    *,
+    resolution: float | None = None,
+    dataset: Path | None = None,
+    points: int | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Write one part of a run, each file whole or not at all; missing parent folders are made.
+
+    Args:
+        folder: the run.
+        what: ``mesh`` or ``cloud`` (PLY), ``colmap`` (a model), ``nerfstudio`` (images and ``transforms.json``) or
+            ``occupancy`` (a grid for ROS, always with z up).
+        output: the file; for ``colmap`` and ``nerfstudio`` the folder.
+        up: ``y-down`` as the run has it; ``z``: x right, y ahead, z up. Cameras keep their own axes, only the world is
+            rotated.
+        resolution: side of a cell of an occupancy grid.
+        dataset: where the images of the run are now, for ``colmap`` and ``nerfstudio``; None where the run found them.
+        points: at most so many of a COLMAP model.
+        progress: called with (stage, done, total).
+
+    Returns:
+        What was written.
+
+    Raises:
+        SlamError: an option that is unknown or has no effect, a part that the run lacks or that is damaged, images
+            that are not found, or a file that cannot be written.
+    """
+    _check_options(what, up, resolution, dataset, points)
+    _check_target(what, output)
+    if what in _MAPS:
+        write_ply(output, _map(folder, what, up))
+    elif what == "occupancy":
+        return _export_occupancy(folder, output, resolution or _RESOLUTION)
+    else:
+        trajectory = _trajectory(folder, up)
+        cloud = _map(folder, "cloud", up) if (folder.path / MAP_CLOUD).is_file() else None
+        if what == "colmap":
+            write_model(folder, output, trajectory, R_UP_WORLDS[up], cloud, dataset, points, progress)
+        else:
+            write_scene(folder, output, trajectory, cloud, dataset, progress)
+    return output
+
+
+def _check_options(what: str, up: str, resolution: float | None, dataset: Path | None, points: int | None) -> None:
+    """Refuse what does not exist, has no effect or makes no sense."""
+    if what not in _OPTIONS:
+        raise RunError(f"--what {what!r} is unknown: choose one of {', '.join(_OPTIONS)}")
+    if up not in R_UP_WORLDS:
+        raise RunError(f"--up {up!r} is unknown: choose {' or '.join(R_UP_WORLDS)}")
+    for name, value in {"resolution": resolution, "dataset": dataset, "points": points}.items():
+        if value is not None and name not in _OPTIONS[what]:
+            takers = ", ".join(taker for taker, options in _OPTIONS.items() if name in options)
+            raise RunError(f"--{name} does nothing for {what}: it is for {takers}")
+    if resolution is not None and not (math.isfinite(resolution) and resolution > 0):
+        raise RunError(f"--resolution {resolution} must be a positive length")
+    if points is not None and points < 1:
+        raise RunError(f"--points {points} is too few: give 1 or more")
+
+
+def _check_target(what: str, output: Path) -> None:
+    """Refuse, before anything is computed, what would replace a file of another kind."""
+    if what in _SCENES:
+        noun, names, is_own = _SCENES[what]
+        if output.exists() and not output.is_dir():
+            raise RunError(f"{output} is a file: {noun} is several files, give the name of a folder")
+        others = [name for name in names if (output / name).exists()]
+        if others and not is_own(output):
+            raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
+        return
+    beginnings = {".yaml": b"", ".pgm": b"P5"} if what == "occupancy" else {".ply": b"ply"}
+    if output.suffix.lower() not in beginnings:
+        named = " or ".join(beginnings)
+        raise RunError(f"{what} is written as {named}; got '{output.name}', give a name that ends so")
+    files = [output]
+    if what == "occupancy":
+        files = [output.with_suffix(suffix) for suffix in beginnings]
+        present = [path for path in files if path.is_file() and path.stat().st_size]
+        if present and not describes_map(files[0]):
+            raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
+    for path in files:
+        check_replaced(path, beginnings)
+
+
+def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Path:
+    unit = folder.metrics().unit
+    if unit not in (METRES, CAMERA_HEIGHTS):
+        raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
+    mesh, trajectory = _map(folder, "mesh", "z"), _trajectory(folder, "z")
+    cells, grid = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
+    written = output.with_suffix(".yaml")
+    write_ros_map(written, cells, (grid.x_min, grid.y_min), resolution, unit)
+    return written
+
+
+def _map(folder: RunFolder, what: str, up: str) -> Ply:
+    """The mesh or cloud of the map in the given axes."""
+    ply = read_ply(folder.require(_MAPS[what]))
+    if len(ply.vertices) == 0 or (ply.triangles is not None and len(ply.triangles) == 0):
+        raise RunError("the map is empty: there is nothing to export")
+    return ply if up == "y-down" else rotated(ply, R_UP_WORLDS[up])
+
+
+def _trajectory(folder: RunFolder, up: str) -> Trajectory:
+    """The optimised trajectory in the given axes."""
+    folder.require(ESTIMATE)
+    trajectory = folder.trajectory("optimised")
+    if trajectory is None:
+        raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
+    frames = folder.metrics().sequence.frames
+    if frames is not None and frames != len(trajectory):
+        raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
+    return replace(trajectory, T_world_camera=se3.make(R_UP_WORLDS[up], np.zeros(3)) @ trajectory.T_world_camera)

@@ -1,1 +1,0 @@
-"""Parts of a run as files for other programs."""

@@ -1,0 +1,298 @@
+"""Localisation of new images in the map of an old run: image retrieval, then PnP against the points of each place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.folder import image_folder
+from erfsfm.common.readers.images import list_images, read_image
+from erfsfm.common.readers.numbering import in_order
+from erfsfm.common.table import DASH, Table
+from slam.config.sections import LoopsConfig, load_stored
+from slam.formats.trajectory import Trajectory, write_kitti, write_tum
+from slam.frames import Frame, Image, Intrinsics, View
+from slam.geometry.resection import consensus, resect
+from slam.geometry.se3 import FloatArray, apply, invert
+from slam.loops.descriptors import FeatureExtractor, hamming
+from slam.loops.places import Places
+from slam.loops.retrieval import PlaceIndex
+from slam.loops.structure import PlaceStructure
+from slam.loops.verification import OF_KEYFRAMES, LoopThresholds, matches
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError, SequenceError
+from slam.runtime.run_files import CONFIG, PLACES
+from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
+from slam.sequences.excerpt import frame_range
+from slam.sequences.images import ImageFiles
+from slam.sequences.undistortion import Undistortion, intrinsics_of
+
+_PLACES_TRIED = 8
+_STARTS = 3  # of these are refined
+_PLACES_AROUND = 12  # around the pose, whose points are looked for in the image
+_MOST_DIFFERING = 50  # bits of descriptors where the pose is known: less sure matches pull it towards itself
+_SAMPLES = 300  # of RANSAC
+_LEAST_POINTS = 8  # of a place, to try it
+_LEAST_INLIERS = 30
+_LEAST_RATIO = 0.5
+_MOST_SIGMA = 0.01  # of the position, over the depth of the points
+_ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """The pose ``T_world_camera`` of an image in the unit of the map; or None and the reason."""
+
+    image: str
+    T_world_camera: FloatArray | None = None
+    nearest_frame: int | None = None
+    inliers: int = 0
+    reason: str = ""
+
+    def tree(self) -> dict[str, Any]:
+        """For JSON: unknown values are null, with the reason."""
+        T_world_camera = self.T_world_camera
+        entry = {"image": self.image, "found": T_world_camera is not None}
+        if T_world_camera is None:
+            values: dict[str, Any] = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
+            return entry | values | {"reason": self.reason}
+        pose = {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
+        return entry | pose | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
+
+
+def image_numbers(images: Path, frames: str | None = None, every: int = 1) -> range:
+    """Numbers of the images to localise, from 0: every n-th of ``A:B``, half-open.
+
+    Raises:
+        SequenceError: no images, or the range is empty or reaches beyond them.
+    """
+    first, last = frame_range(frames or ":", len(image_paths(images)))
+    return range(first, last, every)
+
+
+def localise(
+    images: Path, run: RunFolder, camera: Path | None = None, numbers: range | None = None
+) -> Iterator[Localisation]:
+    """Localise images in the map of a run, one after the other.
+
+    Args:
+        images: an image or a folder of images.
+        run: a finished run with loops switched on.
+        camera: their ``camera.yaml``; None for the one beside them or their folder, or else the camera of the run.
+        numbers: of the images to localise; None for all of them.
+
+    Raises:
+        SlamError, DataError: no images, no places in the run, a camera file that does not fit, or none where the run
+            undistorted its images.
+    """
+    paths = image_paths(images)
+    places = Places.read(run.require(PLACES))
+    if not places.views:
+        raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
+    own_camera = _camera_file(camera, images, paths)
+    if own_camera is None and places.intrinsics.undistorted:
+        raise SequenceError(
+            f"{run.path} undistorted its images, and {images} has no {CAMERA_FILE}: give its --camera, which is fov=70 "
+            "for images without distortion"
+        )
+    localiser = Localiser(
+        places,
+        load_stored(run.require(CONFIG), "loops").loops,
+        None if own_camera is None else intrinsics_of(own_camera),
+    )
+    undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
+    chosen = paths if numbers is None else [paths[number] for number in numbers]
+    unreadable = 0
+    for path in chosen:
+        try:
+            image = read_image(path)
+            yield localiser.locate(path.name, image if undistortion is None else undistortion.apply(image))
+        except (DataError, SequenceError) as error:
+            unreadable += isinstance(error, DataError)
+            if unreadable == len(chosen):
+                raise  # not one of them is an image
+            yield Localisation(path.name, reason=str(error))
+
+
+def localisation_table(found: Sequence[Localisation]) -> Table:
+    """One row an image: position in the map, nearest frame of the run, inliers; below, why one is not found."""
+    rows = []
+    for each in found:
+        row = [each.image, *[DASH] * 5]
+        if each.T_world_camera is not None:
+            position = (f"{value:.2f}" for value in each.T_world_camera[:3, 3])
+            row[1:] = [*position, str(each.nearest_frame), str(each.inliers)]
+        rows.append(row)
+    notes = [f"{each.image} not found: {each.reason}" for each in found if each.T_world_camera is None]
+    head = ["image", "x", "y", "z", "nearest\nframe", "inliers"]
+    return Table(head, rows, f"{len(found) - len(notes)} of {len(found)} images found", notes)
+
+
+def write_localisations(path: Path, found: Sequence[Localisation], numbers: Sequence[int] | None = None) -> None:
+    """Write the poses found: as TUM, or after the number of their frame as KITTI where the name ends in ``.kitti``.
+
+    The stamp, or number, is that of the image, by default its place in the list.
+
+    Raises:
+        RunError: no image was found.
+    """
+    stamps = range(len(found)) if numbers is None else numbers
+    poses = {k: each.T_world_camera for k, each in zip(stamps, found, strict=True) if each.T_world_camera is not None}
+    if not poses:
+        raise RunError(f"none of {len(found)} images was found in the map: {path} is not written")
+    write = write_kitti if path.suffix == ".kitti" else write_tum
+    write(path, Trajectory(np.array(list(poses), dtype=np.float64), np.stack(list(poses.values())), numbered=True))
+
+
+class Localiser:
+    """Localises single images among the places of one run; no network is used."""
+
+    def __init__(self, places: Places, config: LoopsConfig, intrinsics: Intrinsics | None = None) -> None:
+        """Index the places.
+
+        Args:
+            places: of an old run, at least one view.
+            config: thresholds, those of the run's own loops.
+            intrinsics: of the new images; None for those of the run, with images resized to it.
+        """
+        self._places = places
+        self._thresholds = replace(LoopThresholds.of_frames(config), max_hamming=OF_KEYFRAMES.max_hamming)
+        self._resizes = intrinsics is None
+        self._intrinsics = intrinsics or places.intrinsics
+        self._features = FeatureExtractor(self._intrinsics)
+        self._structure = PlaceStructure(places, self._thresholds)
+        self._index = PlaceIndex(places.views)
+
+    def locate(self, name: str, image: Image) -> Localisation:
+        """Localise an image ``(H, W, 3)`` uint8 RGB: at similar places, then in the map around.
+
+        Points of learned depth are used beside triangulated ones where both agree, else only if these are too few.
+
+        Raises:
+            SequenceError: the image has another shape than its camera.
+        """
+        view = self._view(image)
+        rows = self._index.nearest(view, _PLACES_TRIED)
+        if not rows:
+            return Localisation(name, reason="no place of the map is similar")
+        learned = self._structure.confirms_depth(rows)
+        found = self._found(name, rows, view, learned)
+        if found.T_world_camera is None:
+            found = self._found(name, rows, view, not learned)
+        if found.T_world_camera is None:
+            return replace(found, reason=f"{len(rows)} similar places; {found.reason}")
+        away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
+        return replace(found, nearest_frame=self._places.views[int(away.argmin())].index)
+
+    def _view(self, image: Image) -> View:
+        camera = self._intrinsics
+        height, width = image.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            aspect = width * camera.height / (height * camera.width)
+            if not self._resizes or abs(aspect - 1.0) > _ASPECT_TOLERANCE:
+                raise SequenceError(
+                    f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: give its --camera"
+                )
+            image = np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
+        no_depth = np.full(image.shape[:2], np.nan, np.float32)
+        return self._features.view(Frame(0, 0.0, image), no_depth)
+
+    def _found(self, name: str, rows: list[int], view: View, learned: bool) -> Localisation:
+        """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
+        starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
+        starts.sort(key=lambda start: len(start[1]), reverse=True)
+        found = [self._refined(name, start, rows, view, learned) for start in starts[:_STARTS]]
+        nowhere = Localisation(name, reason="no place has corners that fit one pose")
+        return max(found, key=lambda each: each.inliers, default=nowhere)
+
+    def _refined(
+        self,
+        name: str,
+        start: tuple[FloatArray, NDArray[np.intp]],
+        rows: list[int],
+        view: View,
+        learned: bool,
+    ) -> Localisation:
+        """The pose by all corners of the map around a first one; or why it is none."""
+        T_camera_world, _ = start
+        for widening in (4.0, 2.0, 1.0):
+            radius_px = widening * self._thresholds.reprojection_px
+            points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
+            if len(points) < self._thresholds.min_inliers:
+                return Localisation(name, reason=f"only {len(points)} corners agree")
+            pose = resect([T_camera_world], points, pixels, self._intrinsics.K)
+            T_camera_world = pose.T_camera_world
+        inliers = pose.residual_px < self._thresholds.reprojection_px
+        count = int(inliers.sum())
+        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
+            return Localisation(name, reason=f"only {count} of {len(inliers)} corners agree")
+        depth = float(np.median(apply(T_camera_world, points[inliers])[:, 2]))
+        sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
+        if sigma > _MOST_SIGMA:
+            reason = f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
+            return Localisation(name, reason=reason)
+        return Localisation(name, invert(T_camera_world), inliers=count)
+
+    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]] | None:
+        """The pose by one place, as `consensus` gives it."""
+        corners, seen = matches(self._places.views[row], view, self._thresholds)
+        points = self._structure.points(row, learned)[corners]
+        known = np.isfinite(points).all(axis=1)
+        if known.sum() < _LEAST_POINTS:
+            return None
+        pixels = view.pixels[seen[known]].astype(np.float64)
+        return consensus(points[known], pixels, self._intrinsics.K, _SAMPLES, self._thresholds.reprojection_px)
+
+    def _around(
+        self, T_camera_world: FloatArray, rows: list[int], view: View, learned: bool, radius_px: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Points ``(M, 3)`` of the map that look like corners ``(M, 2)`` of the image near where they project."""
+        centre = invert(T_camera_world)[:3, 3]
+        away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - centre, axis=1)
+        near = sorted({*rows, *np.argsort(away)[:_PLACES_AROUND].tolist()})
+        points = np.concatenate([self._structure.points(row, learned) for row in near])
+        X = apply(T_camera_world, points)
+        ahead = X[:, 2] > 0  # false of unknown ones
+        if not ahead.any() or not len(view):
+            return np.zeros((0, 3)), np.zeros((0, 2))
+        points, seen = points[ahead], self._intrinsics.project(X[ahead])
+        descriptors = np.concatenate([self._places.views[row].descriptors for row in near])[ahead]
+        differing = hamming(view.descriptors, descriptors)
+        differing[cdist(view.pixels, seen) > radius_px] = np.inf
+        best = differing.argmin(axis=1)
+        corners = np.flatnonzero(differing[np.arange(len(view)), best] <= _MOST_DIFFERING)
+        return points[best[corners]], view.pixels[corners].astype(np.float64)
+
+
+def image_paths(images: Path) -> list[Path]:
+    """One image, or the images of a folder in their order.
+
+    Raises:
+        SequenceError: there are none.
+    """
+    if images.is_file():
+        return [images]
+    folder = image_folder(images) if images.is_dir() else None
+    if folder is None:
+        what = "no images in it" if images.is_dir() else "no such file or folder"
+        raise SequenceError(f"{images}: {what}; give an image or a folder of png, jpg or bmp images")
+    return list_images(folder)
+
+
+def _camera_file(explicit: Path | None, images: Path, paths: list[Path]) -> CameraFile | None:
+    """That of the user, or else the one that ``run`` would find."""
+    if explicit is None:
+        folder = images if images.is_dir() else images.parent
+        return beside(paths[0].parent, folder, folder.absolute().parent)
+    if is_field_of_view(explicit):
+        return explicit_camera(explicit, ImageFiles(in_order(paths)))
+    return read_explicit(explicit)

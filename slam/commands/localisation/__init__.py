@@ -1,1 +1,0 @@
-"""New images located in the map of an old run."""

@@ -1,0 +1,286 @@
+"""Sparse optical flow: Shi-Tomasi corners, pyramidal Lucas-Kanade from a predicted motion, and back again as a check.
+
+With a flow predicted from learned depth and the last motion, corners are tracked in the image warped back by it. Those
+that are not found there and back, as on other cars, are tracked in the image as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config.sections import VisualOdometryConfig
+from slam.frames import Frame, Grey, Mask, nearest, resized_mask
+from slam.frontend.visual.predicted_flow import PredictedFlow
+from slam.geometry.se3 import FloatArray
+
+Pixels = NDArray[np.float32]
+_TERMINATION = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
+# least eigenvalue of a window's gradients: a tenth of what OpenCV wants, for plain walls
+_LEAST_TEXTURE = 1e-5
+_TILES = 3, 4  # down and across: corners are spread over them
+
+
+class Search(NamedTuple):
+    """A search by windows of ``side`` pixels over ``levels`` of the image pyramid above the full image.
+
+    ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept if a search ``back``
+    returns to within ``error_px`` along both axes. That has its own levels and limits and begins where corners came
+    from; without them it is the same search, and begins where they were found.
+    """
+
+    side: int
+    levels: int
+    limits: tuple[int, float]
+    back: tuple[int, tuple[int, float]] | None
+    error_px: float
+
+
+class Texture(NamedTuple):
+    """Corners by their strength over that of the strongest one of a tile, and their distance, pixels.
+
+    ``block_px`` is the side of the surroundings by which a corner is judged.
+    """
+
+    quality: float
+    spacing_px: float
+    block_px: int
+
+
+OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5)
+OF_KEYFRAMES = Search(side=15, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.62)
+KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
+# displacements that remain after the predicted flow are small
+_PREDICTED_LEVELS = 2
+_WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
+_STEP_QUALITY, _STEP_BLOCK_PX = 0.008, 5
+
+
+def track(
+    first: Grey, second: Grey, pixels: Pixels, search: Search, guesses: Pixels | None = None
+) -> tuple[Pixels, NDArray[np.bool_]]:
+    """Pixels ``(M, 2)`` of the first image found in the second, and which of them were found back ``(M,)``.
+
+    Args:
+        first: ``(H, W)``.
+        second: of the same size.
+        pixels: ``(M, 2)``.
+        search: by which windows.
+        guesses: where the search begins ``(M, 2)``; None is at the pixels themselves.
+    """
+    if not len(pixels):
+        return pixels, np.zeros(0, np.bool_)
+    moved, forward = _lucas_kanade(first, second, pixels, search.side, search.levels, search.limits, guesses)
+    levels, limits = search.back or (search.levels, search.limits)
+    start = None if search.back is None else pixels
+    returned, backward = _lucas_kanade(second, first, moved, search.side, levels, limits, start)
+    near = np.abs(returned - pixels).max(axis=1) < search.error_px
+    return moved, _are_inside(moved, second.shape) & forward & backward & near
+
+
+def _lucas_kanade(
+    first: Grey,
+    second: Grey,
+    pixels: Pixels,
+    side: int,
+    levels: int,
+    limits: tuple[int, float],
+    guesses: Pixels | None,
+) -> tuple[Pixels, NDArray[np.bool_]]:
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        pixels.reshape(-1, 1, 2),
+        None if guesses is None else guesses.reshape(-1, 1, 2).copy(),
+        winSize=(side, side),
+        maxLevel=levels,
+        criteria=(_TERMINATION, *limits),
+        flags=0 if guesses is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=_LEAST_TEXTURE,
+    )
+    return moved.reshape(-1, 2), status.ravel().astype(bool)
+
+
+def _are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which pixels ``(M, 2)`` lie in an image ``(H, W)``."""
+    return np.asarray((pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1))
+
+
+def new_corners(
+    grey: Grey, taken: Pixels, count: int, texture: Texture = KEYFRAME_CORNERS, hidden: Mask | None = None
+) -> Pixels:
+    """Up to ``count`` Shi-Tomasi corners ``(M, 2)``, apart from each other and from those taken.
+
+    All tiles of the image get equally many for as long as they have some, those that are taken among them: one thing
+    that is all texture would have them all, be it the world or not.
+
+    Args:
+        grey: ``(H, W)``.
+        taken: corners ``(K, 2)`` in the image.
+        count: of new corners.
+        texture: what a corner is.
+        hidden: where no corner is wanted ``(h, w)``, in any size.
+    """
+    if count <= 0:
+        return np.zeros((0, 2), np.float32)
+    free = _away_from(taken, int(texture.spacing_px), grey.shape)
+    if hidden is not None:
+        free[resized_mask(hidden, *grey.shape[::-1])] = 0
+    tiles, ranks = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.int64)]
+    for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
+        for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
+            tile, mask = grey[top:bottom, left:right], np.ascontiguousarray(free[top:bottom, left:right])
+            corners = cv2.goodFeaturesToTrack(
+                tile, count, texture.quality, texture.spacing_px, mask=mask, blockSize=texture.block_px
+            )
+            if corners is not None:
+                before = np.count_nonzero(((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1))
+                tiles.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
+                ranks.append(before + np.arange(len(corners)))
+    order = np.argsort(np.concatenate(ranks), kind="stable")[:count]
+    return np.asarray(np.concatenate(tiles)[order])
+
+
+def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A mask ``(H, W)``, zero within ``radius`` of pixels ``(M, 2)`` inside of it."""
+    height, width = shape[0] + 2 * radius, shape[1] + 2 * radius
+    disc = np.zeros((2 * radius + 1,) * 2, np.uint8)
+    rows, columns = np.nonzero(cv2.circle(disc, (radius, radius), radius, 1, -1))
+    u, v = np.rint(pixels).astype(np.int64).T
+    mask = np.full(height * width, 255, np.uint8)
+    mask[np.add.outer(v * width + u, rows * width + columns)] = 0
+    return mask.reshape(height, width)[radius : height - radius, radius : width - radius]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """The same ``M`` scene points in two images: pixels ``(M, 2)`` each, and ``track_ids`` ``(M,)``.
+
+    A corner keeps its identifier from frame to frame for as long as it is tracked. So many were ``sought``.
+    """
+
+    previous: FloatArray
+    current: FloatArray
+    track_ids: NDArray[np.int64]
+    sought: int
+
+    def __len__(self) -> int:
+        return len(self.track_ids)
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners of one image: pixels ``(M, 2)`` and ``track_ids`` ``(M,)``."""
+
+    pixels: Pixels
+    track_ids: NDArray[np.int64]
+
+
+class CornerTracker:
+    """Tracks corners through one sequence and detects new ones where tracks were lost."""
+
+    def __init__(self, config: VisualOdometryConfig) -> None:
+        self._config = config
+        self._corners: dict[int, Corners] = {}  # of the last frames
+        self._next_track_id = 0
+        self._frames_kept = config.rotation_baseline_steps + 2
+
+    def track(
+        self,
+        previous: Frame,
+        current: Frame,
+        predicted_flow: PredictedFlow | None = None,
+        standing: Mask | None = None,
+    ) -> Tracks:
+        """Corners of ``previous`` tracked to ``current``.
+
+        The flow between them may be predicted; pixels that are ``standing`` ``(h, w)`` do not belong to the world.
+        """
+        corners = self._corners.get(previous.index)
+        if corners is None:
+            corners = self._filled(previous, Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64)), standing)
+        forward, kept = self._tracked(previous, current, corners.pixels, predicted_flow)
+        if standing is not None:
+            kept &= ~nearest(resized_mask(standing, *current.grey.shape[::-1]), forward)
+        track_ids = corners.track_ids[kept]
+        if current.index not in self._corners:
+            self._filled(current, Corners(forward[kept], track_ids), standing)
+        before, now = corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
+        return Tracks(before, now, track_ids, len(kept))
+
+    def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
+        """Prepare to track corners of ``previous`` to a frame some steps later.
+
+        The function returned does it, in any thread.
+        """
+        corners = self._corners.get(previous.index)
+        following = min((index for index in self._corners if index > previous.index), default=None)
+        if corners is None or following is None:
+            return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
+        tracked = np.isin(corners.track_ids, self._corners[following].track_ids)
+        points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
+
+        def find() -> Tracks:
+            pixels, kept = _by_first_flow(previous.grey, current.grey, points, [predicted_flow])
+            before, now = points[kept].astype(np.float64), pixels[kept].astype(np.float64)
+            return Tracks(before, now, track_ids[kept], len(kept))
+
+        return find
+
+    def _tracked(
+        self, first: Frame, second: Frame, points: Pixels, predicted_flow: PredictedFlow | None
+    ) -> tuple[Pixels, NDArray[np.bool_]]:
+        """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
+        flows = [predicted_flow, None] if predicted_flow else [None]
+        pixels, kept = _by_first_flow(first.grey, second.grey, points, flows)
+        if kept.sum() < self._config.few_corners:
+            exposed = _histogram_matched(second.grey, first.grey)
+            pixels_wide, kept_wide = _by_first_flow(first.grey, exposed, points, flows, _WIDE_WINDOW_PX)
+            if kept_wide.sum() > kept.sum():
+                return pixels_wide, kept_wide
+        return pixels, kept
+
+    def _filled(self, frame: Frame, arrived: Corners, standing: Mask | None) -> Corners:
+        """Keep the corners tracked to a frame, and new ones up to the largest number."""
+        config, next_id = self._config, self._next_track_id
+        pixels, track_ids = arrived.pixels, arrived.track_ids
+        room = config.max_corners - len(pixels)
+        if room > 0:
+            texture = Texture(_STEP_QUALITY, config.corner_spacing_px, _STEP_BLOCK_PX)
+            fresh = new_corners(frame.grey, pixels, room, texture, standing)
+            pixels = np.concatenate([pixels, fresh])
+            track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])
+            next_id += len(fresh)
+        corners = Corners(pixels, track_ids)
+        self._corners[frame.index], self._next_track_id = corners, next_id
+        for index in sorted(self._corners)[: -self._frames_kept]:
+            del self._corners[index]
+        return corners
+
+
+def _by_first_flow(
+    first: Grey, second: Grey, points: Pixels, flows: Sequence[PredictedFlow | None], side: int = OF_STEPS.side
+) -> tuple[Pixels, NDArray[np.bool_]]:
+    """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``."""
+    pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
+    for flow in flows:
+        tried = np.flatnonzero(~kept)
+        levels = OF_STEPS.levels if flow is None else _PREDICTED_LEVELS
+        image = second if flow is None else flow.warp_back(second)
+        moved, found_back = track(first, image, points[tried], OF_STEPS._replace(side=side, levels=levels))
+        moved = moved[found_back]
+        pixels[tried[found_back]], kept[tried[found_back]] = moved if flow is None else flow.in_current(moved), True
+    return pixels, kept & _are_inside(pixels, second.shape)
+
+
+def _histogram_matched(grey: Grey, other: Grey) -> Grey:
+    """An image ``(H, W)`` with its histogram matched to that of another."""
+    ranks, ranks_other = (np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (grey, other))
+    levels = np.interp(ranks, ranks_other, np.arange(256.0))
+    return np.asarray(cv2.LUT(grey, np.rint(levels).astype(np.uint8)))

@@ -1,0 +1,372 @@
+"""One run: the whole system on one sequence. `SlamPipeline.run` and `SlamPipeline.solve` are its table of contents."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import cached_property, partial
+
+from erfsfm.common.progress import Progress, silent
+from erfsfm.common.signals import calling_on_signals
+from erfsfm.mvs.refine import Decide
+from slam.config.sections import SlamConfig
+from slam.formats.trajectory import Trajectory
+from slam.frames import Frame, Predictor, RelativePose
+from slam.frames import Sequence as FrameSequence
+from slam.frontend import agreement
+from slam.frontend.agreement import Agreement
+from slam.frontend.drive import Drive
+from slam.frontend.factors import chain_odometry, make_factors, with_lidar
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.gap_interpolation import complete_drive
+from slam.frontend.keyframes.relative_poses import keyframe_poses
+from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
+from slam.frontend.network_factors import chain_raw
+from slam.frontend.scale.metric_scale import Scale, find_scale, height_by_lidar
+from slam.frontend.scale.scale_estimate import (
+    ScaleEstimate,
+    resolve_mode,
+    scale_from_distance,
+    scale_from_reference,
+)
+from slam.geometry.geodesy import GpsTrack
+from slam.geometry.se3 import FloatArray
+from slam.graph.pose_graph import PoseGraph
+from slam.loops.closure import LoopClosures, close_loops
+from slam.mapping.depth_refinement import decision
+from slam.mapping.filters import KeyframeDepth
+from slam.mapping.map import TsdfMap
+from slam.pipeline.checks import require_possible, warn_of_doubts
+from slam.pipeline.estimate import Estimate, Odometry
+from slam.pipeline.fusion import fuse
+from slam.pipeline.map_closure import MapClosure, close_maps
+from slam.pipeline.observer import Observations, Observer
+from slam.pipeline.positioning import Location, Positioning
+from slam.runtime.attempt import Failed, attempt
+from slam.runtime.errors import SequenceError, SlamError
+from slam.runtime.imports import import_open3d_beside
+from slam.runtime.threads import read_ahead
+from slam.runtime.timing import Stopwatch
+from slam.sequences.excerpt import first_frames
+
+logger = logging.getLogger(__name__)
+
+
+class Recorder:
+    """Is given each result of a run as soon as it is whole; this one keeps nothing."""
+
+    def frame(self, observer: Observer) -> None:
+        """After every frame."""
+
+    def trajectory(self, name: str, trajectory: Trajectory) -> None:
+        """The reference, the network's chain, odometry: each by its name, before loops are sought."""
+
+    def estimate(self, estimate: Estimate) -> None:
+        """Everything but the map."""
+
+    def keyframe(self, keyframe: KeyframeDepth) -> None:
+        """The depth of each keyframe that is fused."""
+
+    def map(self, estimate: Estimate) -> None:
+        """The same with its map, which is None where mapping is switched off, or no frame has depth."""
+
+    def no_map(self, reason: str) -> None:
+        """An error cost the map."""
+
+
+class SlamPipeline:
+    """From the frames of a sequence to a trajectory and a map."""
+
+    def __init__(
+        self,
+        sequence: FrameSequence,
+        predictor: Predictor,
+        config: SlamConfig,
+        progress: Progress = silent,
+        seed: int = 0,
+        gps_track: GpsTrack | None = None,
+    ) -> None:
+        """Prepare a run.
+
+        Args:
+            sequence: frames in time order.
+            predictor: depth and snippet poses.
+            config: of all parts.
+            progress: called with the stage, done and total.
+            seed: of all RANSAC draws.
+            gps_track: positions of the drive.
+        """
+        self.sequence, self._predictor, self._config = sequence, predictor, config
+        self._progress, self._seed, self._gps_track = progress, seed, gps_track
+        self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
+        self._watch = Stopwatch()
+        self._is_interrupted = False
+
+    def run(
+        self,
+        recorder: Recorder | None = None,
+        frames: Iterator[Frame] | None = None,
+        interrupt: Callable[[], None] | None = None,
+    ) -> Estimate:
+        """Run the whole system.
+
+        Args:
+            recorder: is given the results.
+            frames: of a sequence that grows as they come; None reads them from the sequence.
+            interrupt: ends the pass over the frames at the first signal to end; None ends it after the next frame.
+
+        Raises:
+            SlamError: the sequence is too short, unreadable or lacks what the scale mode needs.
+        """
+        recorder = recorder or Recorder()
+        self.require_possible()
+        if self._config.mapping.enabled:
+            import_open3d_beside()
+        with calling_on_signals(interrupt or self._interrupt):
+            observed = self._observe(recorder, frames)
+        self._leave_out_unseen(observed)
+        self._progress("loops and graph", 0, 1)
+        estimate = self.solve(observed, recorder)
+        warn_of_doubts(estimate.drive, observed.gate)
+        self._progress("loops and graph", 1, 1)
+        recorder.estimate(estimate)
+        mapped = attempt("the map", lambda: self._mapped(estimate, recorder))
+        if isinstance(mapped, Estimate):
+            return mapped
+        recorder.no_map(mapped.reason)
+        return estimate
+
+    def solve(self, observed: Observations, recorder: Recorder) -> Estimate:
+        """Lengths, factors and loops of a drive, and the trajectory that fits them.
+
+        An error in the search for loops costs the loops, one in the graph the loops and the graph: the optimised
+        trajectory then is the odometry.
+
+        Raises:
+            SlamError: no snippet of usable frames, or a source of lengths that contradicts the images.
+        """
+        if (reference := self._reference) is not None:
+            recorder.trajectory("reference", reference)
+        with self._watch.stage("geometry"):
+            poses = keyframe_poses(observed.maps, self.sequence.intrinsics, self._seed)
+        drive = self._completed(observed, MapClosure(poses))
+        network = self._trajectory(chain_raw(drive.snippets, len(drive)))
+        recorder.trajectory("network", network)
+        with self._watch.stage("lidar"):
+            lidar = lidar_path(self.sequence, self._progress)
+        lidar_steps, agreements = self._compared(drive, lidar, observed)
+        with self._watch.stage("scale"):
+            scale = find_scale(self.mode, self.sequence.camera_height_m, drive, lidar_steps)
+        odometry = self._odometry(drive, scale, lidar_steps, agreements)
+        recorder.trajectory("odometry", self._trajectory(odometry.T_world_camera))
+        with self._watch.stage("loops"):
+            closed = attempt("loop closure", lambda: self._closed(odometry, observed))
+        odometry, loops = (odometry, LoopClosures(not_sought=closed.reason)) if isinstance(closed, Failed) else closed
+        location = self._located(odometry)
+        solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
+        if isinstance(solved, Failed):
+            solved = solved, odometry.T_world_camera, LoopClosures(not_sought=solved.reason), location
+        graph, T_optimised, loops, location = solved
+        agreements, support, confidence = self._confidence(odometry, observed)
+        return Estimate(
+            network=network,
+            odometry=self._trajectory(odometry.T_world_camera),
+            optimised=self._trajectory(T_optimised),
+            lidar=lidar,
+            reference=reference,
+            drive=odometry.drive,
+            depth_error=observed.odometry.depth_error,
+            scale=odometry.scale,
+            factors=odometry.factors,
+            views=odometry.views(),
+            loops=loops,
+            graph=graph,
+            location=location,
+            stopwatch=self._watch,
+            agreements=agreements,
+            confidence=confidence,
+            support=support,
+        )
+
+    def fuse(self, estimate: Estimate, recorder: Recorder) -> TsdfMap | None:
+        """The map, as `fusion.fuse`; None where mapping is switched off, or no frame has depth."""
+        if not self._config.mapping.enabled or not estimate.drive.keyframes:
+            return None
+        camera, progress = self.sequence.intrinsics, self._progress
+        return fuse(estimate, camera, self._config, self._decide, recorder.keyframe, progress)
+
+    def observer(self) -> Observer:
+        """Measures the frames of the sequence, one pass."""
+        parts = self._config, self._watch, self._seed, self.sequence.camera_height_m
+        return Observer(self._predictor, self.sequence.intrinsics, *parts)
+
+    def require_possible(self) -> None:
+        """Check that this run can succeed; raises as `checks.require_possible` and `Positioning`."""
+        shortest = self._predictor.sources + 1
+        require_possible(self.sequence, self._config, shortest, self._gps_track is not None)
+        _ = self._positioning
+        _ = self._decide
+
+    def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Observations:
+        """One pass over the frames, to its end or until it is interrupted."""
+        total = len(self.sequence)
+        ahead = read_ahead(partial(read_frame, self.sequence), range(total))
+        with self.observer() as observer, closing(ahead) as read:
+            for index, frame in enumerate(self._watch.each("read", frames or read)):
+                observer.add(index, frame)
+                recorder.frame(observer)
+                self._progress("frames", index + 1, total)
+                if self._is_interrupted:
+                    break
+            return observer.observations()
+
+    def _interrupt(self) -> None:
+        self._is_interrupted = True
+
+    def _leave_out_unseen(self, observed: Observations) -> None:
+        """After an interrupted pass the sequence is what was seen."""
+        seen, total = len(observed.drive), len(self.sequence)
+        if seen == total:
+            return
+        if seen <= self._predictor.sources:
+            raise SlamError(f"interrupted after {seen} frames, before the first snippet of the networks")
+        logger.warning("interrupted: the run is of the first %d of %d frames", seen, total)
+        self.sequence = first_frames(self.sequence, seen)
+        self.__dict__.pop("_positioning", None)
+
+    def _completed(self, observed: Observations, closure: MapClosure) -> Drive:
+        """The drive with its gaps interpolated and the poses of its maps."""
+        events = [*observed.events, *closure.joins]
+        return complete_drive(observed.drive, self._predictor.sources, observed.maps, closure.poses, events)
+
+    def _odometry(
+        self, drive: Drive, scale: Scale, lidar_steps: Sequence[RelativePose], agreements: Sequence[Agreement]
+    ) -> Odometry:
+        """Factors of a drive and the odometry chained from them, in the final unit, which the mode may find first."""
+        if self.mode in ("reference", "known", "gps"):
+            unit = self._unit(chain_odometry(make_factors(drive, scale), len(drive)))
+            if isinstance(unit, ScaleEstimate) and isinstance(scale.estimate, ScaleEstimate) and not scale.is_metric:
+                name, height, spread = f"scale.mode={self.mode}", self.sequence.camera_height_m, scale.estimate.spread
+                agreements = [*agreements, agreement.of_height(name, unit.value, height, spread).required()]
+            scale = scale.in_metres(unit)
+        factors = make_factors(drive, scale)
+        if self._config.lidar.factors and scale.is_metric:
+            factors = with_lidar(factors, lidar_steps)
+        return Odometry(drive, scale, factors, chain_odometry(factors, len(drive)), lidar_steps, agreements)
+
+    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
+        """Metres per unit of an odometry, by what the mode knows of the drive."""
+        sequence = self.sequence
+        if self.mode == "reference" and sequence.reference is not None:
+            return scale_from_reference(T_odometry, sequence.reference)
+        if self.mode == "gps" and self._positioning is not None:
+            return self._positioning.scale(T_odometry)
+        return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
+
+    def _closed(self, odometry: Odometry, observed: Observations) -> tuple[Odometry, LoopClosures]:
+        """The loops of a drive, and its odometry, which that of closed maps replaces."""
+        camera, config, seed = self.sequence.intrinsics, self._config.loops, self._seed
+        if not (observed.maps and config.enabled):
+            views, is_metric = odometry.views(), odometry.scale.is_metric
+            return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
+        closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
+        if closure.loops.accepted:
+            drive = self._completed(observed, closure)
+            odometry = self._odometry(drive, odometry.scale, odometry.lidar_steps, odometry.agreements)
+        return odometry, closure.closures(odometry.scale)
+
+    def _located(self, odometry: Odometry) -> Location | MeasurementFailure | None:
+        """Where the odometry lies on the earth; None without a GPS track."""
+        if self._positioning is None:
+            return None
+        return self._positioning.locate(odometry.T_world_camera, odometry.scale.estimate)
+
+    def _optimised(
+        self, odometry: Odometry, loops: LoopClosures, location: Location | MeasurementFailure | None
+    ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | MeasurementFailure | None]:
+        """The graph, its trajectory ``(N, 4, 4)``, the loops that agree with it, and where it lies on the earth."""
+        graph, positioning = PoseGraph(), self._positioning
+        T_odometry = odometry.T_world_camera
+        graph.add_relative(*odometry.factors, *(loop.measured for loop in loops.accepted))
+        if positioning is not None and isinstance(location, Location):
+            positioning.add_factors(graph, location, T_odometry)
+        with self._watch.stage("graph"):
+            T_optimised = graph.optimise(T_odometry)
+            while graph.drop_contradicted_loops():
+                T_optimised = graph.optimise(T_odometry)
+        if positioning is not None and isinstance(location, Location):
+            location = positioning.relocated(graph, T_optimised, odometry.scale.estimate)
+        return graph, T_optimised, loops.without(graph.dropped), location
+
+    def _mapped(self, estimate: Estimate, recorder: Recorder) -> Estimate:
+        mapped = replace(estimate, map=self.fuse(estimate, recorder))
+        recorder.map(mapped)
+        return mapped
+
+    def _compared(
+        self, drive: Drive, lidar: LidarPath | MeasurementFailure | None, observed: Observations
+    ) -> tuple[Sequence[RelativePose], list[Agreement]]:
+        """Steps by LiDAR unless the images contradict them, and LiDAR and depth from elsewhere beside the images.
+
+        Raises:
+            SlamError: lengths by LiDAR alone, or depth from elsewhere, are wrong.
+        """
+        steps = usable_steps(lidar, are_needed=self.mode == "lidar")
+        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated)]
+        if (height := height_by_lidar(steps, drive)) is not None:
+            by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self.sequence.camera_height_m, 0.0))
+        worst = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
+        compared = [] if worst is None else [worst.required() if self.mode == "lidar" else worst.said()]
+        source, error = self._config.depth.source, observed.odometry.depth_error
+        if source != "network" and (by_depth := agreement.of_depth(source, error)) is not None:
+            compared.append(by_depth.required())
+        return [] if worst is not None and worst.is_wrong else steps, compared
+
+    def _confidence(
+        self, odometry: Odometry, observed: Observations
+    ) -> tuple[list[Agreement], FloatArray | None, float | MeasurementFailure]:
+        """Agreements of all sources and of the images, the support of each frame, and what follows from both."""
+        drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
+        if self._positioning is not None and self._positioning.agreement is not None:
+            by_gps = self._positioning.agreement
+            by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
+        support = None if drive.maps else agreement.frame_support(range(len(drive)), drive.motions)
+        needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
+        camera = self.sequence.intrinsics
+        of_images = agreement.of_images(drive, observed.odometry, camera, support, scale.contradicted, needs_road)
+        if not drive.maps:
+            of_images.append(agreement.of_directions(odometry.T_world_camera))
+        trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]
+        sure = agreement.confidence(trusted, scale.is_metric, bool(drive.maps))
+        return [*by_sources, *of_images], support, sure
+
+    @cached_property
+    def _decide(self) -> Decide | None:
+        """Between learned and measured depth of the map's keyframes."""
+        return decision(self._config.depth) if self._config.mapping.enabled else None
+
+    @cached_property
+    def _positioning(self) -> Positioning | None:
+        """The GPS track matched to the drive, None without one."""
+        track = self._gps_track
+        return None if track is None else Positioning(track, self.sequence.stamps, self._config.gps, self.mode)
+
+    @property
+    def _reference(self) -> Trajectory | None:
+        reference = self.sequence.reference
+        return None if reference is None else self._trajectory(reference)
+
+    def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
+        return Trajectory(self.sequence.stamps, T_world_camera)
+
+
+def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
+    """A frame, or why its image cannot be read."""
+    try:
+        frame = sequence.frame(index)
+        frame.image.setflags(write=False)
+        return frame
+    except SequenceError as error:
+        return error

@@ -1,0 +1,166 @@
+"""Errors of trajectories as tables: of one run, of two files under every alignment, of several runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from erfsfm.common.table import DASH, Table
+from slam.evaluation.trajectory import ALIGNMENTS, TrajectoryMetrics
+from slam.results.metrics import Metrics
+from slam.runtime.errors import RunError
+
+if TYPE_CHECKING:
+    from slam.results.folder import RunFolder
+
+UNITS = "ATE: RMSE, m; of snippets of five frames, each with its own scale, norm / 5. RE: rad. t_rel, r_rel: 7 dof."
+_LEAK = "LEAK: the weights were trained on the sequence; the numbers are no test."
+_OF_ALIGNMENT = {
+    "ATE\nm": ("ate_rmse_m", 3),
+    "t_rel\n%": ("t_rel_percent", 2),
+    "r_rel\ndeg/100m": ("r_rel_deg_per_100m", 3),
+    "RPE\nm": ("rpe_trans_m", 4),
+    "RPE\ndeg": ("rpe_rot_deg", 4),
+    "scale": ("scale", 4),
+}
+
+
+class ErrorColumn(NamedTuple):
+    """One number of a trajectory in the tables: its header, its path in the record and its decimals."""
+
+    name: str
+    path: str
+    decimals: int
+
+
+COLUMNS = (
+    ErrorColumn("snippet\nATE", "snippet5.ate_mean", 4),
+    ErrorColumn("snippet\nRE", "snippet5.re_mean", 4),
+    ErrorColumn("ATE\n7dof", "align.7dof.ate_rmse_m", 3),
+    ErrorColumn("ATE\n6dof", "align.6dof.ate_rmse_m", 3),
+    ErrorColumn("t_rel\n%", "align.7dof.t_rel_percent", 2),
+    ErrorColumn("r_rel\ndeg/100m", "align.7dof.r_rel_deg_per_100m", 3),
+)
+
+
+def written(value: Any, decimals: int) -> str:
+    """A number with its decimals, tiny ones in powers of ten; a dash for a missing one."""
+    if value is None:
+        return DASH
+    if not isinstance(value, float):
+        return str(value)
+    tiny = value != 0 and abs(value) < 0.5 * 10.0**-decimals
+    return f"{value:.1e}" if tiny else f"{value:.{decimals}f}"
+
+
+def errors_table(trajectories: Mapping[str, TrajectoryMetrics], title: str = "") -> Table:
+    """The main errors, a row for each trajectory; below, the reasons of missing numbers, and whether evo agrees."""
+    rows = [[name, *_numbers(errors)] for name, errors in trajectories.items()]
+    found = [off for errors in trajectories.values() if (off := errors.evo.difference) is not None]
+    evo = [f"evo gives the same numbers, to {max(found):.0e}."] if found else []
+    notes = [UNITS, *evo, *missing_notes(trajectories)]
+    return Table(["trajectory", *(column.name for column in COLUMNS)], rows, title, notes)
+
+
+def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
+    """Every statistic of one trajectory under every alignment, and its snippets below."""
+    values = {how: [errors.at(f"align.{how}.{key}") for key, _ in _OF_ALIGNMENT.values()] for how in ALIGNMENTS}
+    decimals = [decimals for _, decimals in _OF_ALIGNMENT.values()]
+    rows = [[how, *(written(value, k) for (value, _), k in zip(row, decimals))] for how, row in values.items()]
+    missing = {reason: None for row in values.values() for value, reason in row if value is None}
+    snippets, evo = errors.snippet5, errors.evo
+    notes = [
+        f"Snippets of five frames: ATE {written(snippets.ate_mean, 4)} ± {written(snippets.ate_std, 4)} m, RE "
+        f"{written(snippets.re_mean, 4)} ± {written(snippets.re_std, 4)} rad, {written(snippets.count, 0)} of them.",
+        f"evo: APE {written(evo.ape_rmse_m_7dof, 3)} m at 7 dof, RPE {written(evo.rpe_trans_m, 4)} m and "
+        f"{written(evo.rpe_rot_deg, 4)} deg; largest difference to ours {written(evo.difference, 1)}.",
+        *(f"{DASH} {reason}." for reason in missing),
+    ]
+    return Table(["alignment", *_OF_ALIGNMENT], rows, title, notes)
+
+
+def runs_table(runs: Sequence[RunFolder]) -> Table:
+    """One row for each run and trajectory; runs that failed or were killed with the reason.
+
+    Raises:
+        RunError: no run was given, or its ``metrics.json`` is damaged.
+    """
+    rows: list[list[str]] = []
+    notes: dict[str, None] = {UNITS: None}
+    for name, metrics in zip(_names(runs), _contents(runs)):
+        errors, title = metrics.evaluated_errors(), name
+        if metrics.failure:
+            ended = "failed" if metrics.status == "failed" else "did not end"
+            title += f", {ended}"
+            notes[f"{name} {ended}: {metrics.failure}."] = None
+        if metrics.provenance.leak is True:
+            title += ", LEAK"
+            notes[_LEAK] = None
+        rows += [[title, each, *_numbers(found)] for each, found in errors.items()]
+        if errors:
+            notes |= {f"{name}: {note}": None for note in missing_notes(metrics.all_errors())}
+        else:
+            rows.append([title, "", *[DASH] * len(COLUMNS)])
+        notes |= {f"{name}: {note}": None for note in metrics.unit_notes()}
+    head = ["run", "trajectory", *(column.name for column in COLUMNS)]
+    return Table(head, rows, "Errors against the reference", list(notes), names=2)
+
+
+def runs_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
+    """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory.
+
+    Raises:
+        RunError: no run was given, or its ``metrics.json`` is damaged.
+    """
+    objects = []
+    for run, metrics in zip(runs, _contents(runs)):
+        tree = metrics.tree()
+        entry: dict[str, Any] = {"run": str(run.path), "status": metrics.status}
+        if metrics.failure:
+            entry["reason"] = metrics.failure
+        entry["leak"] = metrics.provenance.leak
+        objects.append(entry | {key: tree.get(key) for key in ("sequence", "scale", "trajectories")})
+    return objects
+
+
+def missing_notes(trajectories: Mapping[str, TrajectoryMetrics]) -> list[str]:
+    """A line for each reason why numbers are missing, with the trajectories that lack them."""
+    names: dict[str, dict[str, None]] = {}
+    for name, errors in trajectories.items():
+        for value, reason in (errors.at(column.path) for column in COLUMNS):
+            if value is None:
+                names.setdefault(reason, {})[name] = None
+    return [f"{DASH} {', '.join(without)}: {reason}." for reason, without in names.items()]
+
+
+def missing_errors(trajectories: Mapping[str, TrajectoryMetrics]) -> str:
+    """Why no trajectory has an error; empty where one has, or where there is none."""
+    values = [errors.at(column.path) for column in COLUMNS for errors in trajectories.values()]
+    missing = [reason for value, reason in values if value is None]
+    return missing[0] if values and len(missing) == len(values) else ""
+
+
+def _numbers(errors: TrajectoryMetrics) -> list[str]:
+    return [written(errors.at(column.path)[0], column.decimals) for column in COLUMNS]
+
+
+def _names(runs: Sequence[RunFolder]) -> list[str]:
+    """Short names of runs: the folder's own, or the whole path where it is not unique."""
+    names = [run.path.resolve().name for run in runs]
+    return [str(run.path) if names.count(name) > 1 else name for run, name in zip(runs, names)]
+
+
+def _contents(runs: Sequence[RunFolder]) -> list[Metrics]:
+    if not runs:
+        raise RunError("no run was given: name one or more run folders")
+    return [_metrics(run) for run in runs]
+
+
+def _metrics(run: RunFolder) -> Metrics:
+    """The metrics of a run; where it was killed before it wrote them, those of its trajectories."""
+    metrics = run.metrics()
+    if metrics.trajectories.absent and run.trajectory("optimised") is not None:
+        from slam.results.estimate_metrics import metrics_of_trajectories
+
+        return metrics.changed(trajectories=metrics_of_trajectories(run))
+    return metrics

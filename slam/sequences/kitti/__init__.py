@@ -1,1 +1,0 @@
-"""KITTI's layouts: odometry roots, raw drives, calibration and GPS/INS."""

@@ -1,0 +1,94 @@
+"""What measures in a world: the camera's rays and pixels, and a spinning 64-beam LiDAR on the roof."""
+
+import numpy as np
+
+from slam.simulation.geometry import Float32Array, FloatArray
+
+# KITTI odometry 00-02 (rectified colour camera), the size it was recorded at
+_KITTI_SIZE = (1241, 376)
+_KITTI_FOCAL_PX = 718.856
+_KITTI_CENTRE_PX = (607.1928, 185.2157)
+
+
+def kitti_intrinsics(width: int, height: int) -> FloatArray:
+    """KITTI's camera matrix for a resized image, half-pixel exact, ``(3, 3)``."""
+    sx, sy = width / _KITTI_SIZE[0], height / _KITTI_SIZE[1]
+    cx, cy = (_KITTI_CENTRE_PX[0] + 0.5) * sx - 0.5, (_KITTI_CENTRE_PX[1] + 0.5) * sy - 0.5
+    return np.array([[_KITTI_FOCAL_PX * sx, 0.0, cx], [0.0, _KITTI_FOCAL_PX * sy, cy], [0.0, 0.0, 1.0]])
+
+
+def square_intrinsics(width: int, height: int, fov_deg: float) -> FloatArray:
+    """Camera matrix ``(3, 3)`` of square pixels with a horizontal field of view, its centre in the middle."""
+    focal_px = 0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg))
+    return np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+
+
+def pixel_rays(K: FloatArray, width: int, height: int) -> Float32Array:
+    """Directions with z = 1 through every pixel, row by row, camera frame, ``(H * W, 3)``."""
+    v, u = np.mgrid[0:height, 0:width].reshape(2, -1)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(width * height)], axis=1)
+    return rays.astype(np.float32)
+
+
+def footprint(
+    pixel: Float32Array, rays: Float32Array, normals: Float32Array, tangents: Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """Extent of a pixel on a surface along its u and v axes, grazing angle included.
+
+    A round pixel of size f seen at angle a to the normal is an ellipse of axes f and f / cos a; along a
+    tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a).
+
+    Args:
+        pixel: size of the pixel at the surface's distance, metres, ``(N,)``.
+        rays: unit, ``(3, N)``.
+        normals: unit, ``(3, N)``.
+        tangents: unit direction of u, ``(3, N)``.
+    """
+    cosine = np.abs((rays * normals).sum(axis=0))
+    along_u = (rays * tangents).sum(axis=0)
+    cosine2 = np.maximum(cosine * cosine, 1e-4)
+    u2 = along_u * along_u
+    v2 = np.maximum(1.0 - cosine * cosine - u2, 0.0)
+    return pixel * np.sqrt(1.0 + u2 / cosine2), pixel * np.sqrt(1.0 + v2 / cosine2)
+
+
+BEAMS, COLUMNS = 64, 850
+HIGHEST_DEG, LOWEST_DEG = 2.0, -24.8
+NEAREST_M, FARTHEST_M = 2.0, 90.0
+RANGE_NOISE_M, ELEVATION_NOISE = 0.02, 1e-3
+
+# LiDAR: x forward, y left, z up; 8 cm above and 27 cm behind the camera, as on KITTI's car
+T_CAMERA_LIDAR: FloatArray = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -0.08], [1.0, 0.0, 0.0, -0.27], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+def beam_directions(rng: np.random.Generator) -> Float32Array:
+    """Unit directions of one spin in the LiDAR frame, ``(BEAMS * COLUMNS, 3)``.
+
+    Each spin starts at a random angle: with the same rays in every scan the rings on the ground would repeat
+    exactly, and scan matching would estimate zero motion.
+    """
+    azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
+    elevation = np.deg2rad(np.linspace(HIGHEST_DEG, LOWEST_DEG, BEAMS))[:, None]
+    elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
+    directions = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
+    )
+    return directions.reshape(-1, 3).astype(np.float32)
+
+
+def measured(
+    directions: Float32Array, ranges_m: Float32Array, reflectance: Float32Array, rng: np.random.Generator
+) -> Float32Array:
+    """Points x, y, z (LiDAR frame, metres) and reflectance in [0, 1] of the rays that came back, ``(M, 4)``.
+
+    Args:
+        directions: unit, LiDAR frame, ``(N, 3)``.
+        ranges_m: exact, infinite where nothing was hit, ``(N,)``.
+        reflectance: of what was hit, ``(N,)``.
+        rng: of the range noise.
+    """
+    kept = (ranges_m > NEAREST_M) & (ranges_m < FARTHEST_M)
+    noisy = ranges_m[kept] + rng.normal(0.0, RANGE_NOISE_M, int(kept.sum()))
+    return np.column_stack([directions[kept] * noisy[:, None], reflectance[kept]]).astype(np.float32)

@@ -1,0 +1,203 @@
+"""Many drives: manifests, failures apart from results, resumption, workers that die, processes that end with them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from slam.commands.batch import Drive, check_output, drives_of, run_drive, run_drives
+from slam.commands.cli import main
+from slam.commands.cluster import workers
+from slam.runtime.errors import RunError, SequenceError, SlamError
+
+CommandLine = Callable[..., tuple[int, str, str]]
+QUICK = ["--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false"]
+
+UNITS_WITHOUT_METRES = ("camera heights", "the networks' own unit")
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """No progress bar."""
+
+
+def test_a_manifest_names_drives(tmp_path: Path) -> None:
+    manifest = tmp_path / "a.csv"
+    manifest.write_text(
+        "dataset, sequence, camera, options\nkitti,09,,--frames 0:90\nwalk.mp4,,c.yaml,\nother/walk.mp4,,,\n"
+    )
+    found = drives_of(manifest, ["all"], ["--seed", "3"])
+    assert [drive.name for drive in found] == ["09", "walk", "walk-2"]
+    assert found[0].arguments == ("--dataset", "kitti", "--sequence", "09", "--seed", "3", "--frames", "0:90")
+    assert {drive.folder for drive in found} == {tmp_path}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "names no drive"),
+        ("sequence\n09", "drive 1: dataset is missing"),
+        ("dataset,weight\na,b", "'weight' is no key"),
+        ("dataset,options\na,--output b", "--output is no option of a drive"),
+        ("dataset,options\na,--set 'x", "options are not understood"),
+        ("dataset,name\na,x\nb,x", "two drives are named x"),
+        ("dataset\na,more", "'None' is no key"),
+    ],
+)
+def test_a_manifest_that_is_not_understood(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "drives.csv"
+    path.write_text(text)
+    with pytest.raises(SequenceError, match=said):
+        drives_of(path, ["all"], [])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--set mapping.voxel_size_m=-1", "greater than or equal to 0.001"),
+        ("--set=scale.mode=best", "got 'best'"),
+        ("--weights none", "no weights 'none'"),
+        ("--frames 5", "is not a range"),
+    ],
+)
+def test_wrong_options_of_one_drive_are_refused_before_anything_is_written(
+    tmp_path: Path, command_line: CommandLine, words: str, said: str
+) -> None:
+    manifest, output = tmp_path / "drives.csv", tmp_path / "out"
+    manifest.write_text(f"dataset,options\na,\nb,{words}\n")
+    code, _, err = command_line(main, "erfsfm-slam", "batch", manifest, "--output", output)
+    assert code == 1 and said in err and err.count("\n") == 1 and not output.exists()
+
+
+def test_sequences_of_a_data_set(kitti_root: Path) -> None:
+    (drive,) = drives_of(kitti_root, ["all"], [])
+    assert drive.name == "sim" and drive.arguments[:2] == ("--dataset", str(kitti_root.absolute()))
+    with pytest.raises(SequenceError, match="has no sequence 12: it has sim"):
+        drives_of(kitti_root, ["12"], [])
+    with pytest.raises(SequenceError, match=r"no manifest .*none\.csv: check the path"):
+        drives_of(kitti_root / "none.csv", ["all"], [])
+
+
+@pytest.mark.slow
+def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    manifest, output = tmp_path / "drives.csv", tmp_path / "out"
+    manifest.write_text(f"name,dataset\ngood,{kitti_root}\nbad,nowhere\n")
+    words = [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
+    command = [sys.executable, "-m", "slam", "batch", str(manifest), "--output", str(output), *words]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert "1 of 2 drives failed" in ended.stderr and "no data set at nowhere" in ended.stdout
+    with (output / "drives.csv").open() as file:
+        rows = {row["drive"]: row for row in csv.DictReader(file)}
+    assert rows["good"]["status"] == "whole" and rows["good"]["frames"] == "6"
+    assert rows["bad"]["status"] == "failed" and "no data set at nowhere" in rows["bad"]["reason"]
+    written = (output / "good" / "metrics.json").stat().st_mtime_ns
+
+    options = [*words[:6], "--weights", str(tiny_weights), "--frames", "0:6", "--seed", "0", "--device", "auto"]
+    (good, _) = drives_of(manifest, ["all"], options)
+    assert run_drive(good, output).status == "kept"
+    assert (output / "good" / "metrics.json").stat().st_mtime_ns == written
+
+
+def test_a_drive_that_needs_too_much_memory_is_ended(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    """What an earlier run left, which was ended before its map, is no whole run."""
+    (sim,) = drives_of(kitti_root, ["all"], [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"])
+    (tmp_path / "sim").mkdir()
+    command = shlex.join(["erfsfm-slam", "run", *sim.arguments, "--output", str(tmp_path / "sim")])
+    ended = {"status": "estimated", "provenance": {"command": command}}
+    (tmp_path / "sim" / "metrics.json").write_text(json.dumps(ended))
+    (outcome,) = run_drives([sim], tmp_path, 1, None, silent, threads=1, memory_gib=0.05)
+    assert outcome.status == "failed" and "more than the 0.1 GiB of --memory" in outcome.reason
+    assert "more than the 0.1 GiB" in (tmp_path / "drives.csv").read_text()
+    check_output(tmp_path, [sim])
+
+
+def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
+    here, data = tmp_path / "here", tmp_path / "data"
+    shutil.copytree(tiny_weights, here / "mine")
+    shutil.copytree(kitti_root, data / "root")
+    quick = (
+        "mapping: {enabled: false}\nvisual_odometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
+    )
+    (here / "mine.yaml").write_text(quick + "loops: {frame_stride: 3}\n")
+    (data / "mine.yaml").write_text(quick + "loops: {frame_stride: 7}\n")
+    words = ["batch", "../data/root", "--weights", "mine", "--config", "mine.yaml", "--frames", "0:6"]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run(
+        [sys.executable, "-m", "slam", *words, "--output", "out"], cwd=here, env=env, capture_output=True, check=False
+    )
+    assert ended.returncode == 0, ended.stdout.decode() + ended.stderr.decode()
+    assert "frame_stride: 3" in (here / "out/sim/config.yaml").read_text()
+    with (here / "out" / "drives.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["scale"], row["ate_6dof_m"]) == ("none", "") and row["unit"] in UNITS_WITHOUT_METRES
+    assert float(row["ate_7dof_m"]) > 0
+
+
+@pytest.mark.parametrize("name", ["drives.csv", "sim.log"])
+def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, kitti_root: Path, name: str) -> None:
+    drives = drives_of(kitti_root, ["all"], [])
+    check_output(tmp_path, drives)
+    with pytest.raises(RunError, match=r"a drive is named drives\.csv"):
+        check_output(tmp_path, [replace(drives[0], name="drives.csv")])
+    (tmp_path / name).write_text("my own")
+    with pytest.raises(RunError, match=f"{name} is none of ours"):
+        check_output(tmp_path, drives)
+    with pytest.raises(RunError, match="is a file: give a folder"):
+        check_output(tmp_path / name, drives)
+
+
+def dies_once(path: Path) -> str:
+    """The first worker that gets this is killed."""
+    if path.name == "1" and not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if path.name == "2":
+        raise ValueError("a drive that fails")
+    return path.name
+
+
+def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path) -> None:
+    pytest.importorskip("dask.distributed")
+    with workers(2) as spread:
+        results = dict(spread(dies_once, [tmp_path / str(n) for n in range(5)]))
+    assert isinstance(results.pop(2), ValueError)
+    assert results == {0: "0", 1: "1", 3: "3", 4: "4"}
+
+
+def test_an_error_of_the_engine_is_the_drives_reason(tmp_path: Path) -> None:
+    drive = Drive("a", tmp_path / "gone", ())
+    (outcome,) = run_drives([drive], tmp_path / "out", 1, None, silent)
+    assert outcome.status == "failed" and outcome.reason.startswith("FileNotFoundError")
+
+
+def test_many_workers_need_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(SlamError, match=r"erfsfm-slam\[cluster\]"), workers(2):
+        pass
+
+
+def test_a_drive_ends_with_its_worker(tmp_path: Path) -> None:
+    """Its standard input is closed as by the death of the worker."""
+    output = tmp_path / "run"
+    arguments = [str(tmp_path / "lock"), "run", "--output", str(output)]
+    command = [sys.executable, "-m", "slam.commands.batch_process", *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not (output / "run.log").exists() and process.poll() is None:
+            time.sleep(0.05)
+        _, said = process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM and "ended by SIGTERM" in said
+    assert json.loads((output / "metrics.json").read_text())["reason"] == "ended by SIGTERM"

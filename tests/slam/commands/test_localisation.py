@@ -1,0 +1,227 @@
+"""Images of a mapped street are localised in its map; images of other places are refused with a reason."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.common.readers.camera_file import CameraFile
+from slam.commands.localisation import Localiser, image_numbers, localisation_table, localise, write_localisations
+from slam.config.sections import LoopsConfig, dump_yaml, load_config
+from slam.formats.trajectory import Trajectory, associate, read_trajectory, write_kitti
+from slam.frames import Frame, Image, Intrinsics
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.loops.descriptors import FeatureExtractor
+from slam.loops.places import Places
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError, SequenceError
+from slam.runtime.run_files import PLACES
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.options import SimulationOptions
+
+CONFIG = LoopsConfig()
+UNIT = 0.5  # lengths of the map per metre
+
+
+@functools.cache
+def street(seed: int, hazards: tuple[str, ...] = ()) -> SimulatedSequence:
+    return SimulatedSequence(SimulationOptions("straight", 60, seed, 312, 96, hazards))
+
+
+def reference() -> FloatArray:
+    T_world_camera = street(630).reference
+    assert T_world_camera is not None
+    return T_world_camera
+
+
+@functools.cache
+def places() -> Places:
+    """Places as a run on every third frame keeps them, with exact depth."""
+    sequence = street(630)
+    extractor = FeatureExtractor(sequence.intrinsics)
+    frames = range(0, 60, 3)
+    views = []
+    for k in frames:
+        rendered = sequence.street.render(k)
+        depth = np.where(rendered.depth > 0, rendered.depth, np.nan).astype(np.float32)
+        views.append(extractor.view(Frame(k, 0.1 * k, rendered.image), depth, sequence.camera_height_m).scaled(UNIT))
+    T_world_camera = reference()[list(frames)].copy()
+    T_world_camera[:, :3, 3] *= UNIT
+    return Places(sequence.intrinsics, tuple(views), T_world_camera)
+
+
+@pytest.fixture
+def run(make_run: Callable[..., RunFolder]) -> RunFolder:
+    folder = make_run()
+    folder.write(PLACES, places().write)
+    folder.write_text("config.yaml", dump_yaml(load_config()))
+    return folder
+
+
+@pytest.fixture
+def album(tmp_path: Path) -> Path:
+    """Three pictures of the street in other light, one of another street, one damaged."""
+    folder = tmp_path / "album"
+    folder.mkdir()
+    for k in (10, 25, 40):
+        save(folder / f"{k}.png", street(630, ("exposure",)).frame(k).image)
+    save(folder / "50.png", street(631).frame(20).image)
+    (folder / "60.png").write_bytes(b"damaged")
+    return folder
+
+
+def save(path: Path, image: Image) -> None:
+    cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1]))
+
+
+def test_places_read_back(tmp_path: Path) -> None:
+    places().write(tmp_path / PLACES)
+    again = Places.read(tmp_path / PLACES)
+    assert again.intrinsics == places().intrinsics and len(again.views) == 20
+    np.testing.assert_array_equal(again.T_world_camera, places().T_world_camera)
+    for view, other in zip(again.views, places().views, strict=True):
+        assert view.index == other.index
+        for name in ("pixels", "descriptors", "points"):
+            np.testing.assert_array_equal(getattr(view, name), getattr(other, name))
+            assert getattr(view, name).dtype == getattr(other, name).dtype
+
+
+@pytest.mark.parametrize("hazards", [(), ("rain",)])  # the album has another exposure
+def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
+    localiser = Localiser(places(), CONFIG)
+    found = 0
+    for k in range(4, 58, 6):
+        result = localiser.locate(f"{k}", street(630, hazards).frame(k).image)
+        if result.T_world_camera is None:
+            continue
+        found += 1
+        T_error = invert(reference()[k]) @ result.T_world_camera
+        away = np.linalg.norm(result.T_world_camera[:3, 3] / UNIT - reference()[k, :3, 3])
+        assert away < 0.5 and rotation_angle(T_error[:3, :3]) < np.deg2rad(1.0)
+        assert result.nearest_frame is not None and abs(result.nearest_frame - k) <= 2 and result.inliers >= 20
+    assert found >= 7
+
+
+def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -> None:
+    rng = np.random.default_rng(0)
+    views = tuple(
+        replace(view, points=(view.points * rng.lognormal(0.0, 0.5, (len(view), 1))).astype(np.float32))
+        for view in places().views
+    )
+    localiser = Localiser(replace(places(), views=views), CONFIG)
+    for k in (10, 25, 40):
+        found = localiser.locate(f"{k}", street(630).frame(k).image).T_world_camera
+        assert found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
+
+
+def test_another_size_of_the_same_camera_is_found_too() -> None:
+    image = street(630).frame(31).image
+    twice = np.asarray(cv2.resize(image, (624, 192), interpolation=cv2.INTER_CUBIC), np.uint8)
+    assert Localiser(places(), CONFIG).locate("twice", twice).nearest_frame in (30, 33)
+    own = Localiser(places(), CONFIG, places().intrinsics.resized(624, 192)).locate("own", twice)
+    assert own.T_world_camera is not None
+    assert np.linalg.norm(own.T_world_camera[:3, 3] / UNIT - reference()[31, :3, 3]) < 0.5
+    with pytest.raises(SequenceError, match="the image is 300x192, its camera 312x96: give its --camera"):
+        Localiser(places(), CONFIG).locate("cut", twice[:, :300])
+
+
+def bent(image: Image, camera: CameraFile) -> Image:
+    """An image of a pinhole as a lens of the same K takes it."""
+    K = Intrinsics.of(camera.pinhole).K
+    pixels = street(630).intrinsics.pixel_grid().reshape(-1, 1, 2)
+    seen = cv2.undistortPoints(pixels, K, np.array(camera.distortion), P=K).reshape(*image.shape[:2], 2)
+    return np.asarray(cv2.remap(image, seen.astype(np.float32), None, cv2.INTER_LINEAR), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("where", "given"), [("images", ("", "images/25.png")), (".", ("images", "images/25.png")), (None, ())]
+)
+def test_images_of_a_lens_need_its_camera_file(
+    run: RunFolder, tmp_path: Path, where: str | None, given: tuple[str, ...]
+) -> None:
+    """It is looked for where ``run`` looks."""
+    run.write(PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write)
+    pinhole = places().intrinsics
+    keys = {name: getattr(pinhole, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    lens = CameraFile.model_validate(keys | {"fps": 10, "model": "opencv", "distortion": (-0.2, 0.0, 0.0, 0.0)})
+    (tmp_path / "album" / "images").mkdir(parents=True)
+    save(tmp_path / "album" / "images" / "25.png", bent(street(630).frame(25).image, lens))
+    if where is None:
+        with pytest.raises(SequenceError, match=r"undistorted its images, and .*album has no camera\.yaml: give its"):
+            list(localise(tmp_path / "album", run))
+        return
+    (tmp_path / "album" / where / "camera.yaml").write_text(lens.model_dump_json(exclude_none=True))
+    for images in given:
+        (found,) = localise(tmp_path / "album" / images, run)
+        assert found.T_world_camera is not None, found.reason
+        assert np.linalg.norm(found.T_world_camera[:3, 3] / UNIT - reference()[25, :3, 3]) < 0.5
+
+
+@pytest.mark.parametrize("model", ["pinhole", "opencv"])
+def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path, model: str) -> None:
+    lens = "distortion: [-0.1, 0, 0, 0]" if model == "opencv" else "distortion: []"
+    camera = album / "camera.yaml"
+    camera.write_text(
+        f"{{width: 156, height: 48, fx: 90, fy: 90, cx: 77.5, cy: 23.5, fps: 10, model: {model}, {lens}}}"
+    )
+    for found in list(localise(album, run, camera))[:4]:
+        assert found.T_world_camera is None and "the image is 312x96, its camera 156x48: give" in found.reason
+
+
+@pytest.mark.parametrize("what", ["another street", "noise", "black"])
+def test_images_of_other_places_are_refused(what: str) -> None:
+    images = {
+        "another street": [street(seed).frame(k).image for seed in (631, 632) for k in range(5, 55, 20)],
+        "noise": [np.random.default_rng(0).integers(0, 255, (96, 312, 3), np.uint8)],
+        "black": [np.zeros((96, 312, 3), np.uint8)],
+    }[what]
+    localiser = Localiser(places(), CONFIG)
+    for image in images:
+        result = localiser.locate(what, image)
+        assert result.T_world_camera is None and result.nearest_frame is None and result.reason
+
+
+def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    found = list(localise(album, run))
+    assert [each.image for each in found] == ["10.png", "25.png", "40.png", "50.png", "60.png"]
+    assert [each.T_world_camera is not None for each in found] == [True, True, True, False, False]
+    assert "60.png" in found[4].reason
+    entries = json.loads(json.dumps([each.tree() for each in found], allow_nan=False))
+    assert entries[1]["found"] and abs(entries[1]["nearest_frame"] - 25) <= 2
+    assert entries[3] | {"reason": ""} == {
+        "image": "50.png",
+        "found": False,
+        **dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers")),
+        "reason": "",
+    }
+    assert len(localisation_table(found).rows) == 5
+    write_localisations(tmp_path / "found.tum", found)
+    written = read_trajectory(tmp_path / "found.tum")
+    np.testing.assert_array_equal(written.stamps, [0.0, 1.0, 2.0])
+    np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
+    write_localisations(tmp_path / "found.kitti", found, [10, 25, 40, 50, 60])
+    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(60.0), reference()))
+    pair = associate(read_trajectory(tmp_path / "found.kitti"), read_trajectory(tmp_path / "truth.txt"))
+    assert [len(each) for each in pair] == [3, 3]
+    np.testing.assert_allclose(pair[0].positions / UNIT, pair[1].positions, atol=0.5)
+
+
+def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="none of 1 images was found"):
+        write_localisations(tmp_path / "found.tum", list(localise(album / "50.png", run)))
+    assert not (tmp_path / "found.tum").exists()
+
+
+def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path) -> None:
+    with pytest.raises(SequenceError, match="reaches outside"):
+        image_numbers(album, "0:6")
+    run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)
+    with pytest.raises(RunError, match=r"has no places: it ran with loops\.enabled=false"):
+        list(localise(album, run))

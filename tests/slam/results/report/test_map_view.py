@@ -1,0 +1,37 @@
+"""A map is thinned without its whole mesh in memory, and stays the same surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import slam.results.report.map_view
+from slam.formats.ply import Ply, write_ply
+from slam.results.report.map_view import MapMesh, thinned_mesh
+
+
+@pytest.fixture
+def path(plain: Ply, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(slam.results.report.map_view, "_CHUNK", 1000)  # many pieces
+    write_ply(tmp_path / "map_mesh.ply", plain)
+    return tmp_path / "map_mesh.ply"
+
+
+def area(mesh: MapMesh) -> float:
+    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
+    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+@pytest.mark.parametrize("most", [0, 1_000_000])
+def test_a_thinned_map_keeps_its_surface_and_colours(path: Path, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """By cells first, as a large one, and by quadric errors alone."""
+    monkeypatch.setattr(slam.results.report.map_view, "_MOST_TRIANGLES", most)
+    whole, mesh = thinned_mesh(path, 100_000), thinned_mesh(path, 2000)
+    assert 1000 < len(mesh.triangles) <= 2000 < len(whole.triangles)
+    assert mesh.triangles.max() < len(mesh.points) == len(mesh.colours)
+    inner = mesh.points[abs(mesh.points[:, [0, 2]]).max(axis=1) < 70.0]
+    assert np.allclose(inner[:, 1], 1.65)
+    assert area(mesh) == pytest.approx(area(whole), rel=0.1)
+    assert mesh.colours.mean(axis=0) == pytest.approx(whole.colours.mean(axis=0), abs=12.0)

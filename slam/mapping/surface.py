@@ -18,7 +18,6 @@ from scipy.sparse.csgraph import connected_components
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
-from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
 from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, MergedSubmaps, SpilledSubmap
 from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile, with_holes_closed
@@ -50,14 +49,15 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """Of a piece: labels to keep, shared vertices that another piece writes and those it writes, with their groups."""
+class _Rows:
+    """Rows ``(V,)`` of a piece's vertices in the whole mesh, -1 where they are left out.
 
-    parts: Mask
-    elsewhere: NDArray[np.int64]
-    groups_elsewhere: NDArray[np.int64]
-    owned: NDArray[np.int64]
-    groups_owned: NDArray[np.int64]
+    Those from ``begin`` on are its own, the others an earlier piece's. ``triangles`` are kept.
+    """
+
+    numbers: SpilledArray
+    begin: int
+    triangles: int
 
 
 class MapSurface:
@@ -87,8 +87,8 @@ class MapSurface:
         self._extract(submaps, fused, config, progress)
         if not self._pieces:
             raise EmptyMapError(f"the map is empty: no surface was seen {config.min_weight:g} times")
-        self._kept = _chosen(self._pieces, config.min_component_triangles)
-        self.triangles = sum(int(piece.sizes[kept.parts].sum()) for piece, kept in zip(self._pieces, self._kept))
+        self._rows = _numbered(self._pieces, config.min_component_triangles, self._spill)
+        self.triangles = sum(rows.triangles for rows in self._rows)
         if self.triangles == 0:
             raise EmptyMapError("the map is empty: no piece of surface is larger than min_component_triangles")
         everything = sum(int(piece.sizes.sum()) for piece in self._pieces)
@@ -98,8 +98,9 @@ class MapSurface:
 
     def vertex_pieces(self) -> Iterator[NDArray[np.void]]:
         """Vertices as records with position, normal, colour and ``filled``, each once, tile by tile."""
-        for piece, kept in zip(self._pieces, self._kept):
-            yield piece.vertices.read()[self._written(piece, kept)]
+        for piece, rows in zip(self._pieces, self._rows):
+            numbers, first = np.unique(rows.numbers.read(), return_index=True)
+            yield piece.vertices.read()[first[numbers >= rows.begin]]
 
     def cloud_pieces(self) -> Iterator[NDArray[np.void]]:
         """The observed vertices, without the ones that close holes, as records."""
@@ -112,20 +113,16 @@ class MapSurface:
 
     def triangle_pieces(self) -> Iterator[Triangles]:
         """Triangles ``(t, 3)`` of all vertices, tile by tile."""
-        number_of_group: dict[int, int] = {}
-        begin = 0
-        for piece, kept in zip(self._pieces, self._kept):
-            written = self._written(piece, kept)
-            number = begin + np.cumsum(written) - 1
-            begin += int(written.sum())
-            number_of_group |= dict(zip(kept.groups_owned.tolist(), number[kept.owned].tolist()))
-            number[kept.elsewhere] = [number_of_group[group] for group in kept.groups_elsewhere.tolist()]
-            yield number[_kept_triangles(piece, kept)]
+        for piece, rows in zip(self._pieces, self._rows):
+            numbered = rows.numbers.read()[piece.triangles.read()]
+            yield numbered[numbered[:, 0] >= 0]
 
     def meshes(self) -> Iterator[tuple[FloatArray, Triangles]]:
         """Vertices ``(V, 3)`` and triangles ``(T, 3)`` of each tile by itself."""
-        for piece, kept in zip(self._pieces, self._kept):
-            yield Ply(piece.vertices.read()).points, _kept_triangles(piece, kept)
+        for piece, rows in zip(self._pieces, self._rows):
+            triangles = piece.triangles.read()
+            kept = rows.numbers.read()[triangles[:, 0]] >= 0
+            yield Ply(piece.vertices.read()).points, triangles[kept].astype(np.int64)
 
     def write_mesh(self, path: Path) -> None:
         """Write the mesh as binary PLY, atomically; ``RunError`` where that fails."""
@@ -148,18 +145,6 @@ class MapSurface:
                 if patch.own.any():
                     self._pieces.append(_piece(patch, painter, self._spill))
             progress("mesh", done, len(tiles))
-
-    @staticmethod
-    def _written(piece: Piece, kept: _Kept) -> Mask:
-        written: Mask = kept.parts[piece.label.read()]
-        written[kept.elsewhere] = False
-        return written
-
-
-def _kept_triangles(piece: Piece, kept: _Kept) -> Triangles:
-    triangles = piece.triangles.read()
-    chosen: Triangles = triangles[kept.parts[piece.label.read()[triangles[:, 0]]]].astype(np.int64)
-    return chosen
 
 
 def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
@@ -195,8 +180,8 @@ def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
     )
 
 
-def _chosen(pieces: list[Piece], least_triangles: int) -> list[_Kept]:
-    """Parts of at least so many triangles in all tiles together, and which piece writes a shared vertex: the first."""
+def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> list[_Rows]:
+    """Number the vertices of parts of so many triangles in all tiles together; of a shared one, in its first piece."""
     begin = np.cumsum([0, *(len(piece.sizes) for piece in pieces)])
     points = np.concatenate([piece.shared_points for piece in pieces])
     part = np.concatenate([first + piece.shared_labels for first, piece in zip(begin, pieces)])
@@ -205,15 +190,22 @@ def _chosen(pieces: list[Piece], least_triangles: int) -> list[_Kept]:
     link = coo_array((np.ones(len(part), dtype=bool), (part, part[earliest[group]])), shape=(begin[-1], begin[-1]))
     _, whole = connected_components(link, directed=False)
     kept_part = np.bincount(whole, weights=np.concatenate([piece.sizes for piece in pieces]))[whole] >= least_triangles
-    kept, place = [], 0
+    row_of_group = np.full(len(earliest), -1)
+    rows, place, written = [], 0, 0
     for first, last, piece in zip(begin, begin[1:], pieces):
-        rows = np.arange(place, place + len(piece.shared))
-        place += len(piece.shared)
-        is_first, is_kept = earliest[group[rows]] == rows, kept_part[part[rows]]
-        own, other = is_first & is_kept, ~is_first & is_kept
-        shared, groups = piece.shared, group[rows]
-        kept.append(_Kept(kept_part[first:last], shared[other], groups[other], shared[own], groups[own]))
-    return kept
+        own = kept_part[first + piece.label.read()]
+        numbers = np.full(len(own), -1)
+        groups = group[place : place + len(piece.shared)]
+        is_first = earliest[groups] == np.arange(place, place + len(groups))
+        other, firsts = piece.shared[~is_first], piece.shared[is_first]
+        own[other] = False
+        count = int(np.count_nonzero(own))
+        numbers[own] = np.arange(written, written + count)
+        row_of_group[groups[is_first]] = numbers[firsts]
+        numbers[other] = row_of_group[groups[~is_first]]
+        rows.append(_Rows(spill.put(numbers), written, int(piece.sizes[kept_part[first:last]].sum())))
+        place, written = place + len(groups), written + count
+    return rows
 
 
 def _upwards(submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float) -> FloatArray:

@@ -84,7 +84,8 @@ class DataConfig(Section):
     )
     static_frames: Literal["remove", "keep"] = Field(
         default="remove",
-        description="frames of KITTI raw in which the car stands still, found by GPS/IMU, else by image differences",
+        description="frames of KITTI raw and own recordings in which the camera stands still, by GPS/IMU, else "
+        "by image differences",
     )
     weights: dict[str, Annotated[float, Field(gt=0)]] = Field(
         default_factory=dict,

@@ -302,7 +302,8 @@ class ManyViewTeacher:
                     f"{drive.folder} holds not all labels of many views that are wanted: prepare the data again with "
                     "this teacher and this size of the networks"
                 )
-        for drive in without:
+        for done, drive in enumerate(without):
+            progress("teacher: poses", done, len(without))
             drive.measure_poses(weights)
         if self.measures == "poses":
             return

@@ -296,26 +296,29 @@ def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> 
 
 
 def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
-    """The stretches of KITTI raw drives in which the car moves; other recordings as they are."""
-    raw = [recording for recording in recordings if _may_stop(recording)]
-    if config.static_frames == "keep" or not raw:
+    """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
+    stopping = [recording for recording in recordings if _may_stop(recording)]
+    if config.static_frames == "keep" or not stopping:
         return recordings
     kept = [part for r in recordings for part in (moving_parts(r) if _may_stop(r) else [r])]
     lost = sum(map(len, recordings)) - sum(map(len, kept))
-    without_speed = sum(recording.oxts is None for recording in raw)
+    without_speed = sum(recording.oxts is None for recording in stopping)
     logger.info(
-        "left out %d of %d frames of KITTI raw, in which the car stands still by its GPS/IMU speed%s",
+        "left out %d of %d frames in which the camera stands still, by GPS/IMU speed, or by image differences in the "
+        "%d of %d recordings without it",
         lost,
-        sum(map(len, raw)),
-        f" ({without_speed} of {len(raw)} recordings have none: by image differences)" if without_speed else "",
+        sum(map(len, stopping)),
+        without_speed,
+        len(stopping),
     )
     if not kept:
-        raise DataError("the car stands still in every frame found: data.static_frames=keep trains on them")
+        raise DataError("the camera stands still in every frame found: data.static_frames=keep trains on them")
     return kept
 
 
 def _may_stop(recording: Recording) -> bool:
-    return recording.name.startswith("kitti_raw/") and not recording.without_stops
+    own = recording.name.startswith("folder/") and not recording.exact
+    return (own or recording.name.startswith("kitti_raw/")) and not recording.without_stops
 
 
 def _require_known(recordings: Sequence[Recording], weights: Mapping[str, float]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ class Painted:
     """A recording whose frame k is painted k; it counts what is decoded."""
 
     decoded: list[int] = field(default_factory=list)
+    key: tuple[str, Path] = ("painted", Path())
 
     def image(self, index: int, height: int, width: int) -> NDArray[np.uint8]:
         self.decoded.append(index)

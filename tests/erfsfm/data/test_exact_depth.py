@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,7 +18,7 @@ from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
 from erfsfm.data.exact_depth import FARTHEST_M, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.samples import FOCAL_LENGTH
-from erfsfm.data.snippets import SnippetDraws, split_recordings
+from erfsfm.data.snippets import SnippetDraws, chances, split_recordings
 from erfsfm.model_record import read_record
 from erfsfm.training.run import prepare, train
 from slam.simulation.kitti_layout import write_kitti_root
@@ -112,3 +114,32 @@ def test_a_prepared_folder_trains_without_the_worlds(
         torch.testing.assert_close(other["least"], one["least"], msg="exact depth of the same pixels")
     train(mixed((tmp_path / "prepared",)), tmp_path / "run", device="cpu")
     assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["simulated/1", "kitti_odometry/00[0:12]"]
+
+
+def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
+    mixed: Callable[..., ExperimentConfig], write_root: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / "office"
+    (folder / "depth").mkdir(parents=True)
+    (folder / "images").mkdir()
+    depth = np.full((64, 96), 512, np.uint16)  # 2 m
+    depth[:32] = 0
+    for index in range(6):
+        cv2.imwrite(str(folder / "images" / f"{index:06d}.png"), np.full((64, 96, 3), 30 * index, np.uint8))
+        cv2.imwrite(str(folder / "depth" / f"{index:06d}.png"), depth)
+    (folder / "camera.yaml").write_text("width: 96\nheight: 64\nfx: 90\nfy: 90\ncx: 48\ncy: 32\nfps: 5\n")
+    config = mixed((folder, tmp_path / "real"), weights={"folder": 1, "kitti": 1})
+    recordings, _ = split_recordings(config.data)
+    draws = SnippetDraws(recordings, config, 8, imitated=lambda image: np.ones(image.shape[:2], np.float32))
+    sample = draws.draw(0)
+    nearer = 90 / SIZE[0] / FOCAL_LENGTH
+    assert torch.isinf(sample["most"][0, :32]).all()
+    torch.testing.assert_close(sample["least"][0, 32:], torch.full((32, 96), INDOOR_HEIGHT_M / 2 * nearer))
+
+
+def test_worlds_are_drawn_by_their_weight(world: Path, mixed: Callable[..., ExperimentConfig]) -> None:
+    (recording,) = discover(world)
+    twice = [recording, replace(recording, name="folder/office")]
+    np.testing.assert_allclose(chances(twice, [1, 1], {"simulated": 9, "folder": 1}), [0.9, 0.1])
+    with pytest.raises(ValueError, match="less than one sample"):
+        mixed(exact=0.2)

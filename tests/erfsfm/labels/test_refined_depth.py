@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.labels.many_views import label
-from erfsfm.labels.refined_depth import in_camera_heights, refined_label
+from erfsfm.labels.refined_depth import in_camera_heights, refined_label, shrunk
 from erfsfm.mvs.flow import Array, measure
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
@@ -92,3 +92,16 @@ def test_no_scale_where_flow_measures_nothing() -> None:
     blank = np.full((64, 128), 120, np.uint8)
     by_flow = measure(blank, [blank] * 2, street().K, motion(60, (-1, 1)))
     assert in_camera_heights(np.ones((64, 128), np.float32), by_flow) is None
+
+
+def test_a_smaller_label_is_wide_at_edges_and_unknown_where_a_pixel_is():
+    least = np.full((2, 6), 0.2, np.float32)
+    most = np.full((2, 6), 0.22, np.float32)
+    least[:, 3], most[:, 3] = 0.02, 0.022  # a surface ten times as far in half of a block
+    least[0, 5] = 0
+    low, high = shrunk(least, most, 2)
+    np.testing.assert_allclose([low[0, 0], high[0, 0]], [0.2, 0.22], rtol=1e-5)
+    assert low[0, 1] < 0.021
+    assert high[0, 1] > 0.21
+    assert low[0, 2] == 0
+    np.testing.assert_allclose(high[0, 2], 0.22, rtol=1e-5)

@@ -78,7 +78,7 @@ def test_a_lower_bound_alone_penalises_farther_depth():
     disparity = torch.tensor([[[[0.05, 0.2]]]], requires_grad=True)
     interval = Bounds(torch.full((1, 1, 1, 2), 0.1), torch.full((1, 1, 1, 2), torch.inf))
     distance = disagreement(disparity, interval, ZERO)
-    assert distance.item() == pytest.approx(0.6931 / 2, abs=1e-4)
+    assert distance.item() == pytest.approx(0.6931, abs=1e-4), "the satisfied pixel does not count"
     distance.backward()
     assert disparity.grad is not None and disparity.grad[0, 0, 0, 0] < 0 and disparity.grad[0, 0, 0, 1] == 0
 
@@ -113,3 +113,11 @@ def test_rotation_disagreement_is_the_chordal_distance_to_measured_rotations():
     assert distance.item() == pytest.approx(2 * math.sqrt(2) * math.sin(angle / 2), abs=1e-5)
     distance.backward()
     assert torch.isfinite(predicted.grad).all() and (predicted.grad[0, 1] == 0).all()
+
+
+def test_sky_that_is_far_enough_does_not_dilute_what_is_measured():
+    disparity = torch.full((1, 1, 4, 4), 0.1)
+    least, most = torch.full((1, 1, 4, 4), 0.2), torch.full((1, 1, 4, 4), 0.2)
+    all_measured = disagreement(disparity, Bounds(least, most), ZERO)
+    least[..., :2, :], most[..., :2, :] = 0, 0.5
+    torch.testing.assert_close(disagreement(disparity, Bounds(least, most), ZERO), all_measured)

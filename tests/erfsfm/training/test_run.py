@@ -304,6 +304,12 @@ def test_learning_rate_factor(schedule: str, factors: tuple[float, ...]) -> None
         assert learning_rate_factor(schedule, progress) == pytest.approx(factor, abs=1e-5)
 
 
+def test_a_cosine_begins_with_a_warm_up() -> None:
+    rates = [learning_rate_factor("cosine", 0.0, step) for step in (0, 149, 299, 5000)]
+    assert rates == pytest.approx([1 / 300, 0.5, 1, 1])
+    assert learning_rate_factor("constant", 0.0, 0) == 1, "the paper's schedule"
+
+
 def test_initial_weights_pass_on_their_leak_record_and_the_size_of_single_images(
     alone: Configure, small: Small, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

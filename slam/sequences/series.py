@@ -31,7 +31,7 @@ _PIECES = {
         re.compile(r"(?P<head>.*(?:part|chapter|segment)[-_ ]?)(?P<number>\d+)(?P<tail>)"),
     ),
     "ROS bag": (re.compile(r"(?P<head>.*?_?)(?:\d{4}(?:-\d\d){5}_)?(?P<number>\d+)(?P<tail>)"),),
-    "images": (re.compile(r"(?P<head>)(?P<number>\d{3,})(?P<tail>)"),),
+    "images": (re.compile(r"(?P<head>)(?P<number>\d{3})(?P<tail>)"),),
 }
 _NAMED_TO_S = 1.5  # names give whole seconds
 _LONGEST_PAUSE = 3.0  # times the usual distance of two pieces, before another drive begins

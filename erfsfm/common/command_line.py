@@ -81,8 +81,9 @@ def _quieten_libraries() -> None:
     """Only Python writes to standard error: what libraries in C say of a damaged file is said in our own line."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
-    if sys.stderr is not None and sys.stderr is sys.__stderr__:
-        spoken = os.fdopen(os.dup(2), "w", 1, sys.stderr.encoding, sys.stderr.errors)
+    stderr = sys.__stderr__
+    if stderr is not None and sys.stderr is stderr:
+        spoken = os.fdopen(os.dup(2), "w", 1, stderr.encoding, stderr.errors)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = spoken
 

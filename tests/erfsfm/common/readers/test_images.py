@@ -14,7 +14,6 @@ import pytest
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import (
     has_images,
-    image_size,
     list_images,
     read_image,
     read_values,
@@ -30,7 +29,7 @@ def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
     read = read_image(tmp_path / "a.png")
     assert read.shape == (4, 6, 3) and read.dtype == np.uint8 and read.flags.c_contiguous
     assert read[0, 0].tolist() == [200, 0, 0]
-    assert image_size(tmp_path / "a.png") == (4, 6)
+    assert read_image(tmp_path / "a.png").shape == (4, 6, 3)
 
 
 @pytest.mark.parametrize("dtype, value", [(np.uint8, 77), (np.uint16, 77 * 256)])
@@ -74,7 +73,7 @@ def test_depth_maps_keep_their_values(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_values(tmp_path / "d.png"), depth)
 
 
-@pytest.mark.parametrize("read", [read_image, read_values, image_size])
+@pytest.mark.parametrize("read", [read_image, read_values])
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.97])
 def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float, read: Callable[[Path], object]) -> None:

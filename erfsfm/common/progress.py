@@ -51,12 +51,11 @@ def progress_lines(write: Callable[[str], object], every_s: float = 10.0) -> Ite
 
 
 def duration(seconds: float) -> str:
-    """As minutes and seconds, from two hours on in hours, from two days on in days."""
-    if seconds >= 2 * 86400:
-        return f"{seconds / 86400:.1f} days"
-    if seconds >= 2 * 3600:
-        return f"{seconds / 3600:.1f} hours"
-    return f"{round(seconds) // 60} min {round(seconds) % 60} s"
+    """A time in words, to two units at most."""
+    minutes, hours = round(seconds) // 60, round(seconds) // 3600
+    if hours >= 48:
+        return f"{hours / 24:.1f} days"
+    return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {round(seconds) % 60} s"
 
 
 @contextmanager

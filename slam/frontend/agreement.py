@@ -207,7 +207,7 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     if camera.is_guess:
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
     if sigma > _UNSEEN_FOCAL and sigmas <= DOUBTFUL:
-        return Agreement("the focal length", DOUBTFUL, "nothing turns, so that corners do not show it")
+        return Agreement("the focal length", DOUBTFUL, "nothing turns, so that corners do not show it", "good drives")
     return Agreement("the focal length", sigmas, figure) if figure else None
 
 

@@ -241,7 +241,7 @@ def test_evaluate_refuses_a_leak(run: Run, tmp_path: Path, weights: Path, write_
         assert "--allow-leak" in err
         code, out, _ = run(*arguments, "--allow-leak")
         assert code == 0
-        assert all(row["leak"] is True for row in json.loads(out))
+        assert any(row["leak"] is True for row in json.loads(out))
 
 
 def test_evaluate_pose(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:

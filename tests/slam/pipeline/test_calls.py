@@ -70,4 +70,4 @@ def test_calls_a_frame_of_a_hand_held_camera(monkeypatch: pytest.MonkeyPatch):
     truth, calls = room.walk(60), Counter[str]()
     monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", counted(calls, "flow", cv2.calcOpticalFlowPyrLK))
     keyframes = room.tracked(KeyframesConfig(), truth).segments[-1].map.keyframes
-    assert 0 < calls["flow"] <= 2 * len(truth) + 15 * len(keyframes)
+    assert 0 < calls["flow"] <= 2 * len(truth) + 16 * len(keyframes)

@@ -31,8 +31,8 @@ class Search(NamedTuple):
     """A search by windows of ``side`` pixels over ``levels`` of the image pyramid above the full image.
 
     ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept if a search ``back``
-    returns to within ``error_px`` along both axes. That has its own levels and limits and begins where corners came
-    from; without them it is the same search, and begins where they were found.
+    returns to within ``error_px`` by a ``norm`` of this order. That has its own levels and limits and begins where
+    corners came from; without them it is the same search, and begins where they were found.
     """
 
     side: int
@@ -40,6 +40,7 @@ class Search(NamedTuple):
     limits: tuple[int, float]
     back: tuple[int, tuple[int, float]] | None
     error_px: float
+    norm: float
 
 
 class Texture(NamedTuple):
@@ -53,8 +54,8 @@ class Texture(NamedTuple):
     block_px: int
 
 
-OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5)
-OF_KEYFRAMES = Search(side=15, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.62)
+OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
+OF_KEYFRAMES = Search(side=15, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
@@ -82,8 +83,8 @@ def track(
     levels, limits = search.back or (search.levels, search.limits)
     start = None if search.back is None else pixels
     returned, backward = _lucas_kanade(second, first, moved, search.side, levels, limits, start)
-    near = np.abs(returned - pixels).max(axis=1) < search.error_px
-    return moved, _are_inside(moved, second.shape) & forward & backward & near
+    near = np.linalg.norm(returned - pixels, search.norm, axis=1) < search.error_px
+    return moved, forward & backward & near
 
 
 def _lucas_kanade(
@@ -109,7 +110,7 @@ def _lucas_kanade(
     return moved.reshape(-1, 2), status.ravel().astype(bool)
 
 
-def _are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Which pixels ``(M, 2)`` lie in an image ``(H, W)``."""
     return np.asarray((pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1))
 
@@ -278,7 +279,7 @@ def _by_first_flow(
         moved, found_back = track(first, image, points[tried], OF_STEPS._replace(side=side, levels=levels))
         moved = moved[found_back]
         pixels[tried[found_back]], kept[tried[found_back]] = moved if flow is None else flow.in_current(moved), True
-    return pixels, kept & _are_inside(pixels, second.shape)
+    return pixels, kept & are_inside(pixels, second.shape)
 
 
 def _histogram_matched(grey: Grey, other: Grey) -> Grey:

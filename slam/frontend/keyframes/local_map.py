@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
-from slam.frontend.tracking import OF_KEYFRAMES, Pixels, track
+from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, track
 from slam.geometry.se3 import FloatArray, apply, invert
 
 TrackIds = NDArray[np.int64]
@@ -324,4 +324,5 @@ def _matched(
     turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
     pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-    return track(turned, grey, pixels, _MATCHED, guesses)
+    matched, kept = track(turned, grey, pixels, _MATCHED, guesses)
+    return matched, kept & are_inside(matched, grey.shape)

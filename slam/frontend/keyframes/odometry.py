@@ -27,7 +27,7 @@ from slam.frontend.keyframes.image_turn import (
     turned,
 )
 from slam.frontend.keyframes.local_map import MapSegment, TrackedFrame, TrackedKeyframe, TrackIds
-from slam.frontend.tracking import OF_KEYFRAMES, Pixels, new_corners, track
+from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, new_corners, track
 from slam.geometry.epipolar import parallax_px
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
@@ -196,6 +196,7 @@ class KeyframeOdometry:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
         corners = keyframe.places[rows].astype(np.float32)
         tracked, kept = track(keyframe.grey, frame.grey, corners, OF_KEYFRAMES, guesses)
+        kept &= are_inside(tracked, frame.grey.shape)
         shift = np.median(tracked[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]

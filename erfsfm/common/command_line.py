@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import re
@@ -15,6 +16,7 @@ from typing import TextIO
 
 import typer
 
+from erfsfm import __version__
 from erfsfm.common.errors import explained, shows_traceback
 from erfsfm.common.signals import Terminated
 
@@ -45,6 +47,26 @@ class Terminal(logging.StreamHandler[TextIO]):
         for kind, times in self._times.items():
             if times > 1:
                 _say(f"WARNING {kind.partition(':')[0]}: {times - 1} more warnings of this kind")
+
+
+def application(name: str, about: str) -> typer.Typer:
+    """A program of several verbs: plain help, since markup would lose what stands in brackets, and ``--version``."""
+    app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=about)
+
+    def print_version(wanted: bool) -> None:
+        if wanted:
+            typer.echo(f"{name} {__version__}")
+            raise typer.Exit
+
+    @app.callback()
+    def of_all_verbs(
+        version: bool = typer.Option(
+            False, "--version", callback=print_version, is_eager=True, help="print the version and exit"
+        ),
+    ) -> None:
+        pass
+
+    return app
 
 
 def run(app: Callable[..., object], name: str, level: int) -> None:
@@ -81,8 +103,8 @@ def _quieten_libraries() -> None:
     """Only Python writes to standard error: what libraries in C say of a damaged file is said in our own line."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
-    stderr = sys.__stderr__
-    if stderr is not None and sys.stderr is stderr:
+    stderr = sys.stderr
+    if isinstance(stderr, io.TextIOWrapper) and stderr is sys.__stderr__:
         spoken = os.fdopen(os.dup(2), "w", 1, stderr.encoding, stderr.errors)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = spoken

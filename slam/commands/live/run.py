@@ -18,12 +18,15 @@ from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import raising_on_termination
 from slam.commands.live.reader import EXPECTED, StreamedSequence, calibration_of
 from slam.commands.live.source import open_source
-from slam.commands.live.view import Viewer
 from slam.commands.run.recorder import FolderRecorder
 from slam.commands.run.request import RunRequest
 from slam.commands.run.run import provenance_of, record
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
+from slam.frames import Intrinsics
+from slam.frontend.drive import Drive
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.pipeline.checks import require_possible
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.live_poses import LivePose, LivePoses
@@ -42,6 +45,8 @@ from slam.sequences.undistortion import intrinsics_of
 logger = logging.getLogger(__name__)
 
 Emit = Callable[[dict[str, Any]], None]
+_EVERY = 6  # pixel of the depth map, and frame, whose points are shown
+_PATH = (40, 110, 240)
 _DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"
 
 
@@ -166,6 +171,47 @@ class LiveRecorder(FolderRecorder):
         if dropped > self._dropped and now_s - self._dropped_said_s >= 1.0:
             self._dropped, self._dropped_said_s = dropped, now_s
             logger.warning("%d images dropped, %d measured", dropped, len(self._sequence))
+
+
+class Viewer:
+    """Opens the viewer; it is shown what the drive has while it lasts."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        """Start it; ``SlamError`` where rerun is not installed."""
+        (self._rr,) = import_extra("rerun")
+        self._intrinsics = intrinsics
+        self._positions: list[FloatArray] = []
+        self._stream = self._rr.RecordingStream("erfsfm-slam live")
+        self._stream.spawn()
+        self._stream.log("world", self._rr.ViewCoordinates.RDF, static=True)
+
+    def show(self, index: int, drive: Drive, newest: LivePose) -> None:
+        """A frame at its pose; its image and depth where it is a keyframe."""
+        rr, stream, T = self._rr, self._stream, newest.T_world_camera
+        stream.set_time("frame", sequence=index)
+        self._positions.append(T[:3, 3])
+        stream.log("world/path", rr.LineStrips3D([np.array(self._positions[-2000:])], colors=[_PATH]))
+        stream.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        keyframe = drive.keyframes[-1] if drive.keyframes else None
+        if keyframe is None or index - keyframe.index > 1 or newest.unit is None:
+            return
+        image, depth = keyframe.image, newest.unit * keyframe.depth_unscaled
+        height, width = depth.shape
+        camera = self._intrinsics.resized(width, height)
+        pinhole = rr.Pinhole(image_from_camera=camera.K, width=width, height=height)
+        stream.log("world/camera/image", pinhole, rr.Image(image).compress(jpeg_quality=85))
+        stream.log("depth", rr.DepthImage(depth))
+        if index % _EVERY == 0:
+            grid = np.s_[height // 3 :: _EVERY, ::_EVERY]
+            near = depth[grid] < np.nanmedian(depth) * 2
+            points = (camera.rays(camera.pixel_grid()[grid]) * depth[grid][..., None])[near]
+            cloud = rr.Points3D(se3.apply(T, points), colors=image[grid][near])
+            stream.log(f"world/map/{index}", cloud)
+
+    def correct(self, trajectory: Trajectory) -> None:
+        """The path of the whole drive, with its loops closed."""
+        self._stream.log("world/path", self._rr.LineStrips3D([trajectory.positions], colors=[(20, 160, 60)]))
+        self._stream.flush()
 
 
 def pose_message(index: int, stamp: float, newest: LivePose, unit: str | None) -> dict[str, Any]:

@@ -33,7 +33,7 @@ _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
 _FOCAL = 0.04  # relative, of the focal length that corners show: flow and lens bias it
-_TELLING_FOCAL, _UNSEEN_FOCAL = 0.1, 0.2  # largest sigma of one that says something; of a camera that goes straight on
+_TELLING_FOCAL = 0.1  # largest sigma of one that says something
 # of good drives (docs/reliability.md): mean and spread
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
@@ -191,10 +191,7 @@ def _overlap(support: FloatArray) -> tuple[float, str]:
 
 
 def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
-    """By the focal length that corners show; None where they show too little. A guess is a doubt in any case.
-
-    Of a camera that goes straight on, nothing tells a wrong one, whose lengths are as wrong: that leaves a doubt.
-    """
+    """By the focal length that corners show; None where they show too little. A guess is a doubt in any case."""
     logarithm, sigma = found.error or (0.0, np.inf)
     sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
     figure = "nobody calibrated it" if camera.is_guess else ""
@@ -206,8 +203,6 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
             figure += f": try fov={np.rad2deg(fov):.0f}"
     if camera.is_guess:
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
-    if sigma > _UNSEEN_FOCAL and sigmas <= DOUBTFUL:
-        return Agreement("the focal length", DOUBTFUL, "nothing turns, so that corners do not show it", "good drives")
     return Agreement("the focal length", sigmas, figure) if figure else None
 
 

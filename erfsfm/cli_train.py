@@ -42,7 +42,7 @@ def train(
     Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
     """
     from erfsfm.config import load_experiment
-    from erfsfm.training.comparison import depth_before_and_after
+    from erfsfm.training.run import depth_before_and_after
     from erfsfm.training.run import prepare as prepare_training
     from erfsfm.training.run import train as run_training
 

@@ -302,15 +302,7 @@ def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Reco
         return recordings
     kept = [part for r in recordings for part in (moving_parts(r) if _may_stop(r) else [r])]
     lost = sum(map(len, recordings)) - sum(map(len, kept))
-    without_speed = sum(recording.oxts is None for recording in stopping)
-    logger.info(
-        "left out %d of %d frames in which the camera stands still, by GPS/IMU speed, or by image differences in the "
-        "%d of %d recordings without it",
-        lost,
-        sum(map(len, stopping)),
-        without_speed,
-        len(stopping),
-    )
+    logger.info("left out %d of %d frames in which the camera stands still", lost, sum(map(len, stopping)))
     if not kept:
         raise DataError("the camera stands still in every frame found: data.static_frames=keep trains on them")
     return kept

@@ -18,12 +18,11 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import DepthPosePredictor, has_bfloat16
 from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP
 from erfsfm.networks.fusion_net import LEVELS, FusionNet
 from erfsfm.networks.torch_network import exported
 from erfsfm.training.fusion_samples import FusionSamples, Sample
-from erfsfm.training.precision import has_bfloat16
 
 RECORD = "fusion.json"
 _BATCH = 8

@@ -101,8 +101,6 @@ class SelfSupervision(lightning.LightningModule):
         self._watched = torch.stack([result.total.detach(), _spread(result)])
         self.log("loss", self._watched[0])
         self.log_dict({f"loss/{name}": value for name, value in self._terms.items()})
-        if result.disparities and self.global_step % (20 * self.config.training.log_every) == 0:
-            self._log_pictures(snippets, result.disparities[0], result.warped)
         return result.total
 
     def on_after_backward(self) -> None:
@@ -252,17 +250,6 @@ class SelfSupervision(lightning.LightningModule):
 
     def _note(self, name: str, value: float) -> None:
         self._validation.setdefault(name, []).append(value)
-
-    def _log_pictures(self, snippets: SnippetBatch, disparity: Tensor, warped: Tensor | None) -> None:
-        """Input, a warped source and the disparity of the first sample, for TensorBoard."""
-        for logger in self.loggers:
-            if isinstance(logger, lightning.pytorch.loggers.TensorBoardLogger):
-                shown = disparity[0] / disparity[0].max()
-                board = logger.experiment
-                board.add_image("target", snippets.target[0], self.global_step)
-                if warped is not None:
-                    board.add_image("source warped", warped[0, len(warped[0]) // 2].clamp(0, 1), self.global_step)
-                board.add_image("disparity", shown, self.global_step)
 
 
 def _spread(result: ObjectiveResult) -> Tensor:

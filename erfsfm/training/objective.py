@@ -63,15 +63,13 @@ class SnippetBatch:
 class ObjectiveResult:
     """The loss, its terms, and the networks' outputs.
 
-    ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(S, N, 4, 4)``;
-    ``warped`` ``(S, N, 3, H, W)`` the sources at full resolution warped to the target, None without photometric error.
+    ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(S, N, 4, 4)``.
     """
 
     total: Tensor
     terms: dict[str, Tensor]
     disparities: list[Tensor]
     T_source_target: Tensor
-    warped: Tensor | None
 
 
 def to_network_range(image: Tensor) -> Tensor:
@@ -167,7 +165,6 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
     elif config.teacher.rotation_weight > 0 and batch.T_source_target is not None:
         T_warp = with_rotation(T_source_target, batch.T_source_target[..., :3, :3])
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
-    finest: Tensor | None = None
     snippets = batch.snippets()
     for level in range(loss.scales if prediction.disparities and len(snippets.target) > 0 else 0):
         scale = _Level.of(snippets, prediction.disparities[level][-len(snippets.target) :], config)
@@ -176,7 +173,6 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
             warped, projection = scale.warp(T_warp)
             mask = prediction.masks[level] if prediction.masks is not None else None
             photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
-            finest = warped.reshape(batch.sources.shape) if level == 0 else finest
     if config.network.fidelity == "paper":
         photometric = 2 * photometric  # the reference compares images in [-1, 1]
     terms = {"photometric": photometric, "smoothness": smoothness}
@@ -189,7 +185,7 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
         terms |= teacher_terms
         for name, weight in config.teacher.weights.items():
             total = total + weight * teacher_terms.get(name, total.new_zeros(()))
-    return ObjectiveResult(total, terms, prediction.disparities, T_source_target, finest)
+    return ObjectiveResult(total, terms, prediction.disparities, T_source_target)
 
 
 def _teacher_terms(

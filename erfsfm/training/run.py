@@ -36,16 +36,18 @@ from erfsfm.data.exact_depth import by_label, stacked
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
-from erfsfm.inference import choose_device
+from erfsfm.evaluation.many_view_truth import many_view_errors
+from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
 from erfsfm.training.keeper import Average, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
-from erfsfm.training.precision import has_bfloat16
 from erfsfm.training.progress import StepProgress
 from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
+
+_LEFT_OUT = ("method", "leak")  # the same in all rows
 
 
 def train(
@@ -129,6 +131,29 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
     with tempfile.TemporaryDirectory() as temporary:
         teacher = measured_views(measured, config, config.teacher.cache or Path(temporary), progress)
         write_prepared(output, training, held_out, teacher, config.network, progress)
+
+
+def depth_before_and_after(
+    config: ExperimentConfig, output: Path, device: str, progress: Progress
+) -> list[dict[str, Any]]:
+    """Errors by many views, a row for each held-out stretch by the initial weights, then by the trained ones.
+
+    Args:
+        config: of the training, with initial weights.
+        output: its weights.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        progress: told of the stage, what is done, and of how many.
+
+    Raises:
+        DataError, TrainingError: no depth could be measured there.
+    """
+    _, validation = split_recordings(config.data)
+    cache, rows = config.teacher.cache or output / MEASUREMENTS, []
+    for when, weights in (("before", str(config.initial_weights)), ("after", str(output))):
+        networks = DepthPosePredictor.from_weights(weights, device)
+        errors = many_view_errors(networks, validation, cache, True, progress)
+        rows += [{"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT} for row in errors]
+    return rows
 
 
 def _require_devices(wanted: int, device: str) -> None:

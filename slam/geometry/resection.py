@@ -22,6 +22,7 @@ _ITERATIONS = 12
 # radians, and units of the map: hundredths of a pixel
 _CONVERGED = 5e-5
 _LEAST_PIXEL_SIGMA = 0.1
+_DAMPING = 1e-13  # of the trace: points hardly in front of the camera leave a matrix that is singular in doubles
 # below this inlier ratio the pose may be one that some wrong tracks agree on
 _DOUBTFUL_RATIO = 0.75
 _CLEARLY = 2.0  # times the support of the pose by all points, of that by trusted ones in its place
@@ -163,7 +164,8 @@ def _refined(
         scale = max(0.5 * INLIER_PX, median(norm[votes]))
         weight = np.where(votes & (X[:, 2] > LEAST_DEPTH), 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
         weighted = (weight * J).reshape(6, -1)
-        information = weighted @ J.reshape(6, -1).T + 1e-9 * np.eye(6)
+        information = weighted @ J.reshape(6, -1).T
+        information += (1e-9 + _DAMPING * np.trace(information)) * np.eye(6)
         step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
         T = compose(make(rotation_matrix(step[:3]), step[3:]), T)
         residual, J, X = _whitened(T, points, spread, rays, focal)

@@ -28,7 +28,8 @@ def test_own_fine_tunes_default_on_any_drive(tmp_path: Path, caplog: pytest.LogC
         done = CliRunner().invoke(app, [*command, "--device", "cpu", *(f"--set={each}" for each in settings)])
     assert done.exit_code == 0, done.output
     assert "a step takes" in caplog.text
-    head, before, after = (line.split() for line in done.stdout.splitlines()[-3:])
+    cells = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.split()}
+    head, before, after = (cells[name] for name in ("depth", "before", "after"))
     assert head[:3] == ["depth", "recording", "abs_rel"]
     assert [before[:2], after[:2]] == [["before", "simulated/77[24:44]"], ["after", "simulated/77[24:44]"]]
     assert before[2] != after[2] and float(after[2]) < 0.3

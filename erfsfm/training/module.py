@@ -30,7 +30,7 @@ from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_ob
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
 _CONSTANT_STEPS = 100
-_WARM_UP = 300  # steps; Adam's first ones at full rate made trained weights 5 to 16 % worse
+_WARM_UP = 300  # steps, or a twentieth of the run; Adam's first ones at full rate made weights 5 to 16 % worse
 
 
 class SelfSupervision(lightning.LightningModule):
@@ -272,7 +272,8 @@ def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> f
 def learning_rate_factor(schedule: str, progress: float, step: int = _WARM_UP) -> float:
     """Factor on the learning rate after a fraction of the run; a cosine ends at 2 % and begins with a warm-up."""
     if schedule == "cosine":
-        return (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2) * min((step + 1) / _WARM_UP, 1)
+        risen = min(max((step + 1) / _WARM_UP, 20 * progress), 1)
+        return risen * (0.51 + 0.49 * math.cos(math.pi * progress))
     return 0.1 if schedule == "step" and progress >= 0.75 else 1.0
 
 

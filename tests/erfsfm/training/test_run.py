@@ -307,6 +307,7 @@ def test_learning_rate_factor(schedule: str, factors: tuple[float, ...]) -> None
 def test_a_cosine_begins_with_a_warm_up() -> None:
     rates = [learning_rate_factor("cosine", 0.0, step) for step in (0, 149, 299, 5000)]
     assert rates == pytest.approx([1 / 300, 0.5, 1, 1])
+    assert learning_rate_factor("cosine", 0.05, 3) > 0.99, "a short run has a short one"
     assert learning_rate_factor("constant", 0.0, 0) == 1, "the paper's schedule"
 
 

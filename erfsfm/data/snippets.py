@@ -32,6 +32,7 @@ from erfsfm.labels.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
 
+_SHORTEST_STOP = 10  # frames of an own recording
 _SHORTEST_END = 20  # frames: fewer give neither a trajectory with its scale nor depth by many views
 _DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
 
@@ -297,20 +298,25 @@ def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> 
 
 def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
     """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
-    stopping = [recording for recording in recordings if _may_stop(recording)]
-    if config.static_frames == "keep" or not stopping:
+    if config.static_frames == "keep":
         return recordings
-    kept = [part for r in recordings for part in (moving_parts(r) if _may_stop(r) else [r])]
-    lost = sum(map(len, recordings)) - sum(map(len, kept))
-    logger.info("left out %d of %d frames in which the camera stands still", lost, sum(map(len, stopping)))
-    if not kept:
+    kept = [part for recording in recordings for part in _moving(recording)]
+    before = sum(map(len, recordings))
+    if (lost := before - sum(map(len, kept))) > 0:
+        logger.info("left out %d of %d frames in which the camera stands still", lost, before)
+    if recordings and not kept:
         raise DataError("the camera stands still in every frame found: data.static_frames=keep trains on them")
     return kept
 
 
-def _may_stop(recording: Recording) -> bool:
-    own = recording.name.startswith("folder/") and not recording.exact
-    return (own or recording.name.startswith("kitti_raw/")) and not recording.without_stops
+def _moving(recording: Recording) -> list[Recording]:
+    """A doubled frame of an own video is no stop, and its drive stays whole for the teacher."""
+    kind, _, _ = recording.name.partition("/")
+    if recording.without_stops or kind not in ("kitti_raw", "folder") or recording.exact:
+        return [recording]
+    if kind == "kitti_raw":
+        return moving_parts(recording)
+    return [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= min(_SHORTEST_END, len(recording))]
 
 
 def _require_known(recordings: Sequence[Recording], weights: Mapping[str, float]) -> None:

@@ -25,11 +25,17 @@ STILL_LEVELS = 1.5  # of 255; five real drives at 2.4 m/s and more never changed
 _SMALL = (104, 32)  # columns, rows: coarse enough to average noise away
 
 
-def moving_parts(recording: Recording) -> list[Recording]:
-    """The stretches of a recording in which the car moves, in order; all of it where it never stops."""
-    moving = (~_still(recording)).astype(np.int8)
-    edges = np.flatnonzero(np.diff(moving, prepend=0, append=0))  # starts and ends, alternating
-    return [recording.part(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+def moving_parts(recording: Recording, shortest_stop: int = 1) -> list[Recording]:
+    """The stretches of a recording between stops of that many frames, in order; all of it where it never stops."""
+    moving = np.ones(len(recording), np.bool_)
+    for start, stop in _runs(_still(recording)):
+        moving[start:stop] = stop - start < shortest_stop
+    return [recording.part(int(start), int(stop)) for start, stop in _runs(moving)]
+
+
+def _runs(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Starts and ends ``(K, 2)`` of the runs of chosen frames."""
+    return np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
 
 
 def _still(recording: Recording) -> NDArray[np.bool_]:

@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.config import DataConfig
 from erfsfm.data.discovery import open_drive
 from erfsfm.data.recordings import Recording
+from erfsfm.data.snippets import split_recordings
 from erfsfm.data.standstill import moving_parts
 
 WriteDrive = Callable[..., Path]
@@ -86,3 +88,18 @@ def test_real_recordings_never_stand_still(data_root: Path) -> None:
     assert spans(recording) == [(0, 144)]
     blind = Recording(recording.name, recording.images[:40], recording.camera)
     assert spans(blind) == [(0, 40)]
+
+
+@pytest.mark.parametrize(("standing", "expected"), [(3, [(0, 60)]), (14, [(0, 20), (34, 60)])])
+def test_a_doubled_frame_of_an_own_recording_is_no_stop(
+    tmp_path: Path, standing: int, expected: list[tuple[int, int]]
+) -> None:
+    folder = tmp_path / "drive"
+    (folder / "images").mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    for index in range(60):
+        shift = 4 * (index if index < 20 else max(19, index - standing))
+        cv2.imwrite(str(folder / "images" / f"{index:06d}.png"), street(shift, 0, 0, rng))
+    (folder / "camera.yaml").write_text("width: 208\nheight: 64\nfx: 150\nfy: 150\ncx: 104\ncy: 32\nfps: 10\n")
+    training, _ = split_recordings(DataConfig(roots=[folder], validation=[]))
+    assert [(part.start, part.start + len(part)) for part in training] == expected

@@ -18,6 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -192,12 +193,8 @@ def main(words: Sequence[str] | None = None) -> None:
                 training.run(options.device, progress)
             results[training.name] = training.evaluate(options.kitti, options.raw, options.split, options.device)
             text = tables(rows, results)
-            _write(options.output / "tables.md", text)
+            write_atomically(options.output / "tables.md", partial(Path.write_text, data=text, encoding="utf-8"))
     print(text)
-
-
-def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 if __name__ == "__main__":

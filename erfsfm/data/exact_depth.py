@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -26,8 +25,8 @@ class ExactImages:
         self, recordings: Sequence[Recording], chances: NDArray[np.float64], config: ExperimentConfig, cache: ImageCache
     ) -> None:
         self._recordings, self._chances, self._config, self._cache = recordings, chances, config, cache
-        size = (config.network.height, config.network.width)
-        self._depth = ArrayCache(depth_mb(config.data), size, np.float16)
+        self._size = (config.network.height, config.network.width)
+        self._depth = ArrayCache(depth_mb(config.data), self._size, np.float32)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Tensor]:
         """A `single_image` of a random frame."""
@@ -35,19 +34,13 @@ class ExactImages:
         index = int(rng.integers(len(recording)))
         network, height_m = self._config.network, recording.camera_height_m
         assert height_m is not None, "recordings are exact"
-        depth_m = self._depth.get((*recording.key, index), lambda: self._shrunk(recording, index)).astype(np.float32)
+        depth_m = self._depth.get((*recording.key, index), lambda: recording.shrunk_depth(index, *self._size))
         seen = depth_m > 0
         beyond = height_m / FARTHEST_M if recording.name.startswith("simulated/") else np.inf
         most = np.where(seen, height_m / np.where(seen, depth_m, 1), beyond)
         image = self._cache.image(recording, index)
         camera = recording.camera.resized(network.width, network.height, network.fidelity)
         return single_image(image, camera, [np.where(seen, most, 0), most], self._config, rng)
-
-    def _shrunk(self, recording: Recording, index: int) -> NDArray[np.float32]:
-        depth_m, network = recording.true_depth(index), self._config.network
-        assert depth_m is not None, "recordings are exact"
-        small = cv2.resize(depth_m, (network.width, network.height), interpolation=cv2.INTER_NEAREST_EXACT)
-        return np.asarray(small, np.float32)
 
 
 def depth_mb(config: DataConfig) -> int:

@@ -138,7 +138,8 @@ def write_prepared(
                 _write_truth(place, recording, middle)
             elif recording.exact:
                 for index in range(len(recording)):
-                    _put(place.depth(recording.start + index), _shrunk_depth(recording, index, network))
+                    depth = np.rint(recording.shrunk_depth(index, network.height, network.width) * 256)
+                    _put(place.depth(recording.start + index), bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]))
             elif teacher is not None:
                 _write_labels(teacher.drive(recording), place, network)
         total = sum(map(len, recordings))
@@ -221,13 +222,6 @@ def _write_labels(measured: DriveLabels, place: _Place, network: NetworkConfig) 
     for target in measured.targets(network.sources):
         if measured.label_file(target).is_file():
             _put(kept.label_file(target), encode(*measured.label(target)))
-
-
-def _shrunk_depth(recording: Recording, index: int, network: NetworkConfig) -> bytes:
-    depth_m = recording.true_depth(index)
-    assert depth_m is not None, "the recording is exact"
-    small = cv2.resize(depth_m, (network.width, network.height), interpolation=cv2.INTER_NEAREST_EXACT)
-    return bytes(cv2.imencode(".png", np.rint(small * 256).astype(np.uint16))[1])
 
 
 def _put(path: Path, data: bytes) -> None:

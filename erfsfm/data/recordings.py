@@ -9,6 +9,7 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -103,6 +104,12 @@ class Recording:
         """z-depth in metres ``(H, W)``, 0 where unknown; None where the frame has no depth."""
         path = None if self.depth is None else self.depth[index]
         return None if path is None else read_values(path).astype(np.float32) / np.float32(256)
+
+    def shrunk_depth(self, index: int, height: int, width: int) -> NDArray[np.float32]:
+        """As `true_depth` of a frame that has it, by the nearest pixels at another size, of ``image`` as a rule."""
+        depth_m = self.true_depth(index)
+        assert depth_m is not None, "the frame has depth"
+        return np.asarray(cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
 
     def true_poses(self, fidelity: Fidelity = "default") -> NDArray[np.float64] | None:
         """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.

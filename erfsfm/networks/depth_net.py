@@ -57,6 +57,8 @@ class DepthNet(nn.Module):
     image, as stride 2 with dilation 2 does.
     """
 
+    input_channels = 3  # of the encoder
+
     def __init__(
         self,
         variant: Variant = "plain",
@@ -93,11 +95,6 @@ class DepthNet(nn.Module):
         if fidelity == "default":
             for head in self.heads:
                 nn.init.constant_(cast(Tensor, head.bias), FIRST_LOGIT)
-
-    @property
-    def input_channels(self) -> int:
-        """Channels of the encoder's input."""
-        return 3
 
     def encoder_layers(self) -> list[Layer]:
         """Geometry of the encoder's convolutions, first to last."""

@@ -172,6 +172,8 @@ class Lite0DepthNet(nn.Module):
     start as plain ones.
     """
 
+    input_channels = 3  # of the encoder
+
     def __init__(self, variant: Variant = "plain", width: float = 1.0) -> None:
         super().__init__()
         self.variant = variant
@@ -191,11 +193,6 @@ class Lite0DepthNet(nn.Module):
         initialise(self, "default")
         for head in [*self.heads, self.full_head]:
             nn.init.constant_(cast(Tensor, head.bias), FIRST_LOGIT)
-
-    @property
-    def input_channels(self) -> int:
-        """Channels of the encoder's input."""
-        return 3
 
     def encoder_layers(self) -> list[Layer]:
         """Geometry of the encoder's convolutions wider than a pixel, first to last."""

@@ -139,29 +139,22 @@ class LossConfig(Section):
 
 
 class TeacherConfig(Section):
-    """Pseudo-labels from classical geometry of the same images, or of another network; off by default."""
+    """Labels: the truth of simulated worlds, classical geometry of the same images, another network; off by default."""
 
-    views: Literal["two", "many", "network"] = Field(
-        default="two",
-        description="two: each snippet by itself; many: poses by the SLAM system, learned depth refined by neighbours; "
-        "network: the depth of the network of slam_weights, which is imitated",
+    views: Literal["exact", "many", "network"] = Field(
+        default="exact",
+        description="exact: true depth and poses of simulated worlds; many: poses by the SLAM system, learned depth "
+        "refined by neighbours; network: the depth of the network of slam_weights, which is imitated",
     )
     stride: int = Field(default=2, ge=1, description="every how many frames a label is measured under many views")
     slam_weights: str = Field(
         default="sim", description="weights of the SLAM system that gives the poses, or of the imitated network"
     )
-    rotation_weight: float = Field(
-        default=0.0, ge=0, description="weight of the rotation error; measured rotations then also warp the images"
-    )
+    rotation_weight: float = Field(default=0.0, ge=0, description="weight of the rotation error")
     translation_weight: float = Field(
         default=0.0, ge=0, description="weight of the translation error, in the depth's unit"
     )
-    structure_weight: float = Field(default=0.0, ge=0, description="weight of the depth error up to a scale per image")
-    unit_weight: float = Field(
-        default=0.0,
-        ge=0,
-        description="weight of the scale error: the depth's unit in heights of the camera above the road",
-    )
+    structure_weight: float = Field(default=0.0, ge=0, description="weight of the depth error")
     edge_weight: float = Field(
         default=0.0, ge=0, description="weight of the error of the inverse depth's steps between pixels"
     )
@@ -171,7 +164,7 @@ class TeacherConfig(Section):
         description="first steps without photometric error, which needs a good initial guess; 0: none",
     )
     cache: Path | None = Field(
-        default=None, description="folder that keeps the measurements; many views: else OUTPUT/teacher"
+        default=None, description="folder that keeps what many views measured; else OUTPUT/teacher"
     )
 
     @property
@@ -181,10 +174,19 @@ class TeacherConfig(Section):
             "rotation": self.rotation_weight,
             "translation": self.translation_weight,
             "structure": self.structure_weight,
-            "unit": self.unit_weight,
             "edge": self.edge_weight,
         }
         return {name: weight for name, weight in every.items() if weight > 0}
+
+    @property
+    def exact(self) -> bool:
+        """Whether every label is the truth of a simulated world."""
+        return self.views == "exact" and bool(self.weights)
+
+    @property
+    def gives_motion(self) -> bool:
+        """Whether labels hold the motion, which then warps the images."""
+        return self.views != "network" and bool(self.weights)
 
 
 class TrainingConfig(Section):
@@ -264,8 +266,7 @@ class ExperimentConfig(Section):
     def single_images(self) -> bool:
         """Whether labels of depth are all that is learned from, so that a sample needs no other view."""
         by_images = self.loss.photometric_weight + self.loss.smoothness_weight > 0 or self.network.masks
-        labelled = self.teacher.views != "two" and self.teacher.structure_weight > 0
-        return self.training.networks == "depth" and labelled and not by_images
+        return self.training.networks == "depth" and self.teacher.structure_weight > 0 and not by_images
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
@@ -277,9 +278,9 @@ class ExperimentConfig(Section):
                 "network.masks needs a loss.mask_weight above 0 (Zhou et al. 2017 take 0.2): without it masks of zero "
                 "have the least loss, and nothing else is learned"
             )
-        if self.data.exact > 0 and (self.teacher.views == "two" or self.teacher.structure_weight == 0):
+        if self.data.exact > 0 and (self.teacher.views == "exact" or self.teacher.structure_weight == 0):
             raise ValueError(
-                "data.exact needs teacher.views: many or network, whose lengths have the unit of exact depth, and a "
+                "data.exact needs teacher.views: many or network, the labels of the rest of each batch, and a "
                 "teacher.structure_weight above 0"
             )
         if self.data.exact > 0 and self.training.of_batch(self.data.exact) == 0:
@@ -293,8 +294,11 @@ class ExperimentConfig(Section):
                 "teacher.views: network teaches depth alone: set training.networks=depth, loss.photometric_weight=0 "
                 "and a teacher.structure_weight above 0"
             )
-        if self.training.networks == "pose" and self.teacher.views != "many":
-            raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
+        if self.training.networks == "pose" and not self.teacher.gives_motion:
+            raise ValueError(
+                "training.networks: pose needs teacher.views: exact or many, which know the motion without depth, and "
+                "a teacher.rotation_weight or teacher.translation_weight above 0"
+            )
         if self.training.minutes > 0 and self.training.devices > 1:
             raise ValueError("training.minutes needs training.devices: 1: the clocks of several would differ")
         network, plain = self.network, any("lite0" not in name for name in (self.network.depth, self.network.pose))

@@ -15,7 +15,7 @@ from erfsfm.data.weather import weathered
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.structure import HEIGHTS, TeacherStructure
 
-# An image does not show its focal length. Under a teacher with one scale a drive, lengths are those of a camera of this
+# An image does not show its focal length. Under a teacher lengths are those of a camera of this
 # focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
 FOCAL_LENGTH = 1.9
 
@@ -46,11 +46,9 @@ def training_sample(
     sample = as_tensors(images, varied.K)
     if seen is not None:
         T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
-        nearer = 1.0
-        if config.teacher.views != "two":
-            nearer = _nearer(varied, config)
-            T_source_target = T_source_target.copy()
-            T_source_target[:, :3, 3] /= nearer
+        nearer = _nearer(varied, config)
+        T_source_target = T_source_target.copy()
+        T_source_target[:, :3, 3] /= nearer
         sample["T_source_target"] = torch.from_numpy(T_source_target)
         sample |= _bounds(bounds, nearer)
     probability = config.data.weather

@@ -20,7 +20,7 @@ from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
-from erfsfm.data.exact_depth import ExactImages, by_label, depth_mb
+from erfsfm.data.exact_depth import ExactImages, ExactLabels, by_label, depth_mb
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, depth_alone, single_image, training_sample
@@ -28,7 +28,7 @@ from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
 from erfsfm.geometry.camera import Camera
-from erfsfm.labels.structure import StructureCache, TeacherStructure
+from erfsfm.labels.structure import TeacherStructure
 
 logger = logging.getLogger(__name__)
 
@@ -54,20 +54,20 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._rank = rank
-        images_mb = config.data.cache_mb - depth_mb(config.data) - (0 if many_views is None else labels_mb(config.data))
-        self._cache = ImageCache(images_mb, config.network.height, config.network.width)
+        labels = depth_mb(config) + (0 if many_views is None else labels_mb(config.data))
+        self._cache = ImageCache(config.data.cache_mb - labels, config.network.height, config.network.width)
         self._reader = SnippetReader()
-        self._structures = StructureCache(config.teacher.cache)
+        self._exact_labels = ExactLabels((config.network.height, config.network.width), depth_mb(config))
         self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
-        exact, self._measured = by_label(self.recordings, config.data)
+        exact, self._measured = by_label(self.recordings, config)
         weights = config.data.weights
         _require_known(self.recordings, weights)
         windows = [len(recording) - length + 1 for recording in self._measured]
         self._probabilities = chances(self._measured, windows, weights)
         worlds = chances(exact, [1] * len(exact), weights)  # a long world is as good as a short one
-        self._exact = ExactImages(exact, worlds, config, self._cache) if exact else None
+        self._exact = ExactImages(exact, worlds, config, self._cache, self._exact_labels) if exact else None
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
@@ -118,12 +118,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         return range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
 
     def _structure(self, snippet: Snippet, images: list[NDArray[np.uint8]], camera: Camera) -> TeacherStructure | None:
-        """What the teacher measured, if there is one."""
+        """The label of a snippet, if there is a teacher."""
         if self._imitated is not None:
             return depth_alone(self._imitated(images[len(images) // 2]), camera, self._config)
         if self._many_views is not None:
             return self._many_views.structure(snippet.recording, snippet.first, self._config.network.sources)
-        return self._structures.structure(images, camera.K) if self._config.teacher.weights else None
+        if self._config.teacher.exact:
+            return self._exact_labels.structure(snippet.recording, snippet.first, self._config.network.sources)
+        return None
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):

@@ -49,11 +49,3 @@ def pose_vector_to_matrix(pose_vec_trans_euler: Tensor) -> Tensor:
 def transform_points(T_a_b: Tensor, points_b: Tensor) -> Tensor:
     """Points ``(B, 3, P)`` in b moved to a by ``T_a_b`` ``(B, 4, 4)``."""
     return T_a_b[:, :3, :3] @ points_b + T_a_b[:, :3, 3:]
-
-
-def with_rotation(T_a_b: Tensor, R_a_b: Tensor) -> Tensor:
-    """``T_a_b`` ``(..., 4, 4)`` with its rotation replaced by ``R_a_b`` ``(..., 3, 3)`` where that is not NaN."""
-    known = torch.isfinite(R_a_b).all(dim=-1).all(dim=-1)[..., None, None]
-    R = torch.where(known, torch.nan_to_num(R_a_b), T_a_b[..., :3, :3])
-    top = torch.cat([R, T_a_b[..., :3, 3:]], dim=-1)
-    return torch.cat([top, T_a_b[..., 3:, :]], dim=-2)

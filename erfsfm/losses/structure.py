@@ -1,4 +1,4 @@
-"""Losses of depth and motion against two-view geometry (the teacher), up to its scale error."""
+"""Losses of depth and motion against the labels of a teacher."""
 
 from __future__ import annotations
 
@@ -27,13 +27,6 @@ class Bounds:
     least: Tensor
     most: Tensor
 
-    def log_scale(self, disparity: Tensor) -> Tensor:
-        """Mean of log disparity minus log measured ``(B, 1, 1, 1)``, over pixels with narrow bounds; 0 without any."""
-        narrow = (self.least > 0) & (self.most < MAX_BOUND_RATIO * self.least)
-        middle = torch.where(narrow, (self.least * self.most).sqrt(), 1)
-        difference = torch.where(narrow, disparity.log() - middle.log(), 0).sum(dim=(1, 2, 3), keepdim=True)
-        return difference / narrow.sum(dim=(1, 2, 3), keepdim=True).clamp(min=1)
-
 
 def enlarged(disparity: Tensor, level: int, size: tuple[int, int]) -> Tensor:
     """Disparity ``(B, 1, h, w)`` of a pyramid level at the full size (height, width): ``(B, 1, H, W)``.
@@ -46,7 +39,7 @@ def enlarged(disparity: Tensor, level: int, size: tuple[int, int]) -> Tensor:
     return full[..., : size[0], : size[1]]
 
 
-def disagreement(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
+def disagreement(disparity: Tensor, bounds: Bounds, log_scale: float) -> Tensor:
     """Mean Huber loss of log disparity, over pixels with a bound.
 
     Between both bounds it is the square of the distance from their middle, outside it is linear with slope 1: a pixel
@@ -57,7 +50,7 @@ def disagreement(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor
     Args:
         disparity: inverse depth ``(B, 1, H, W)``, positive.
         bounds: of the same size.
-        log_scale: log of the disparity's scale over that of the bounds, ``(B, 1, 1, 1)``.
+        log_scale: log of the disparity's scale over that of the bounds.
     """
     has_most, has_least = torch.isfinite(bounds.most), bounds.least > 0
     scaled = disparity.log() - log_scale

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.geometry.camera import scale_intrinsics
-from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
+from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.geometry.warp import Projection, project_into_source, sample
 from erfsfm.labels.structure import HEIGHTS
 from erfsfm.losses.photometric import photometric_error
@@ -33,7 +33,7 @@ class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(S, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
     The sources are of the last S targets; the others are single images with bounds of their depth. S may be 0.
-    Measurements of the teacher (`erfsfm.labels.structure`), where one is used: ``T_source_target``
+    Labels of the teacher (`erfsfm.labels.structure`), where one is used: ``T_source_target``
     ``(S, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the B targets' inverse depth.
     With simulated weather: ``shown`` ``(S, N + 1, 3, H, W)``, all images in time order as the networks get them.
     """
@@ -131,16 +131,15 @@ class _Prediction:
 def needs_depth(config: ExperimentConfig) -> bool:
     """Whether any term of the loss depends on the depth network."""
     loss, teacher = config.loss, config.teacher
-    by_teacher = teacher.structure_weight + teacher.edge_weight + teacher.unit_weight
-    two_view_lengths = teacher.translation_weight if teacher.views == "two" else 0
-    weights = loss.photometric_weight + loss.smoothness_weight + by_teacher + two_view_lengths
+    by_teacher = teacher.structure_weight + teacher.edge_weight
+    weights = loss.photometric_weight + loss.smoothness_weight + by_teacher
     return config.training.networks != "pose" and weights > 0
 
 
 def needs_poses(config: ExperimentConfig) -> bool:
-    """Whether any term of the loss depends on the pose network; many views give the motion that warps images."""
+    """Whether any term of the loss depends on the pose network; a teacher may give the motion that warps images."""
     teacher = config.teacher
-    warps = config.loss.photometric_weight > 0 and teacher.views == "two"
+    warps = config.loss.photometric_weight > 0 and not teacher.gives_motion
     by_teacher = teacher.rotation_weight + teacher.translation_weight > 0
     return warps or (by_teacher and config.training.networks != "depth")
 
@@ -159,11 +158,9 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
     T_source_target = pose_vector_to_matrix(prediction.pose_vectors)
     loss = config.loss
     T_warp = T_source_target
-    if config.teacher.views == "many" and batch.T_source_target is not None:
+    if config.teacher.gives_motion and batch.T_source_target is not None:
         T_warp = batch.T_source_target.clone()
         T_warp[..., :3, 3] /= HEIGHTS
-    elif config.teacher.rotation_weight > 0 and batch.T_source_target is not None:
-        T_warp = with_rotation(T_source_target, batch.T_source_target[..., :3, :3])
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     snippets = batch.snippets()
     for level in range(loss.scales if prediction.disparities and len(snippets.target) > 0 else 0):
@@ -195,27 +192,18 @@ def _teacher_terms(
     bounds: Bounds,
     config: ExperimentConfig,
 ) -> dict[str, Tensor]:
-    """Loss terms of the teacher's measurements.
-
-    Two views measure the unit, the camera's height over the road, only roughly: depth and motion are compared after it
-    has been fitted to the depth network's, and the unit itself is a separate term. Many views have one scale a drive.
-    """
+    """Loss terms of the teacher's labels."""
     terms: dict[str, Tensor] = {}
-    unit = bounds.least.new_full((len(bounds.least), 1, 1, 1), math.log(HEIGHTS))
     disparities = prediction.disparities
     if disparities:
-        log_scale = bounds.log_scale(disparities[0])
-        terms["unit"] = (log_scale - math.log(HEIGHTS)).abs().mean()
-        unit = unit if config.teacher.views != "two" else log_scale.detach()
         height, width = bounds.least.shape[-2:]
         levels = [enlarged(disparities[k], k, (height, width)) for k in range(config.loss.scales)]
-        terms["structure"] = torch.stack([disagreement(level, bounds, unit) for level in levels]).mean()
+        terms["structure"] = torch.stack([disagreement(level, bounds, math.log(HEIGHTS)) for level in levels]).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)
     if needs_poses(config) and T_measured is not None:
-        t_measured = T_measured[..., :3, 3] * torch.exp(-unit[-len(T_measured) :, ..., 0])
         terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
-        terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], t_measured)
+        terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], T_measured[..., :3, 3] / HEIGHTS)
     return terms
 
 

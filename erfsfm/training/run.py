@@ -126,7 +126,7 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
         )
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
-    _, measured = by_label(training, config.data)
+    _, measured = by_label(training, config)
     held_out = ValidationSnippets(validation, config).snippets if validation else []
     with tempfile.TemporaryDirectory() as temporary:
         teacher = measured_views(measured, config, config.teacher.cache or Path(temporary), progress)
@@ -190,7 +190,7 @@ def _draws(
     done_steps, rank = position
     together = config.training.batch * config.training.devices
     draws, done = config.training.steps * together, done_steps * together
-    _, measured = by_label(training, config.data)
+    _, measured = by_label(training, config)
     folder = config.teacher.cache or output / MEASUREMENTS
     many_views = measured_views(measured, config, folder, progress)
     return SnippetDraws(training, config, draws, done, rank, many_views, imitated(config))

@@ -158,11 +158,6 @@ class TeacherConfig(Section):
     edge_weight: float = Field(
         default=0.0, ge=0, description="weight of the error of the inverse depth's steps between pixels"
     )
-    alone_steps: int = Field(
-        default=0,
-        ge=0,
-        description="first steps without photometric error, which needs a good initial guess; 0: none",
-    )
     cache: Path | None = Field(
         default=None, description="folder that keeps what many views measured; else OUTPUT/teacher"
     )

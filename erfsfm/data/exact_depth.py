@@ -45,7 +45,7 @@ class ExactLabels:
             self._poses[recording.key] = recording.true_poses()
         T_world_camera = self._poses[recording.key]
         T_source_target = np.full((sources, 4, 4), np.nan, np.float32)
-        if T_world_camera is not None:
+        if T_world_camera is not None and recording.camera_height_m is not None:
             T_source_target = snippet_motion(T_world_camera, first, sources)
             T_source_target[:, :3, 3] /= recording.camera_height_m
         return TeacherStructure(T_source_target, *self.bounds(recording, first + sources // 2))

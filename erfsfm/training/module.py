@@ -45,8 +45,6 @@ class SelfSupervision(lightning.LightningModule):
         super().__init__()
         self.config = config
         self._clock = clock
-        geometric = config.loss.model_copy(update={"photometric_weight": 0.0})
-        self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self.depth_input: DepthInput | None = None  # of the network that this training goes on with
@@ -96,7 +94,7 @@ class SelfSupervision(lightning.LightningModule):
         snippets = SnippetBatch(
             batch["target"], sources, batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
         )
-        result = evaluate_objective(self.depth_net, self.pose_net, snippets, self._config_of_step())
+        result = evaluate_objective(self.depth_net, self.pose_net, snippets, self.config)
         self._terms = {name: value.detach() for name, value in result.terms.items()}
         self._watched = torch.stack([result.total.detach(), _spread(result)])
         self.log("loss", self._watched[0])
@@ -128,10 +126,6 @@ class SelfSupervision(lightning.LightningModule):
                 f"{self.global_step}): nothing is learned from it; lower training.learning_rate or "
                 "loss.smoothness_weight and start again; the weights so far are in last/"
             )
-
-    def _config_of_step(self) -> ExperimentConfig:
-        """The configuration with the loss of this step."""
-        return self._teacher_alone if self.global_step < self.config.teacher.alone_steps else self.config
 
     def train(self, mode: bool = True) -> Self:
         """Training mode, except for a network that is not trained: its batch statistics would drift."""

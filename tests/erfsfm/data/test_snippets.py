@@ -16,9 +16,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.common.errors import DataError
-from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
+from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
+from erfsfm.data.many_view_teacher import snippet_motion
+from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
+from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -265,31 +268,37 @@ def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]) -> 
     assert validation == ["kitti_odometry/06[0:3]"]
 
 
-def test_a_mirrored_sample_has_mirrored_structure(tmp_path: Path) -> None:
-    street = SimulatedStreet(SimulationOptions(frames=250, seed=702))
-    camera = {"width": 416, "height": 128, "fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "fps": 10}
-    camera |= dict(zip(("fx", "fy", "cx", "cy"), map(float, street.K[[0, 1, 0, 1], [0, 1, 2, 2]])))
-    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
-    for index in range(3):
-        cv2.imwrite(str(tmp_path / f"{index}.png"), street.render(30 + index).image[..., ::-1])
-    samples = []
-    for flip in (0.0, 1.0):
-        config = experiment(sources=2, flip=flip, zoom=1.0).model_copy(
-            update={
-                "network": NetworkConfig(sources=2),
-                "teacher": TeacherConfig(structure_weight=1, cache=tmp_path / "kept"),
-            }
-        )
-        samples.append(SnippetDraws(discover(tmp_path), config, draws=4).draw(0))
-    straight, mirrored = samples
-    assert torch.isfinite(straight["most"]).float().mean() > 0.5
+def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path: Path) -> None:
+    """True motion and depth in camera heights, of a camera of the reference focal length."""
+    street = SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64))
+    write_kitti_root(street, tmp_path, depth=True)
+    (recording,) = discover(tmp_path)
+    config = experiment(sources=2, zoom=1.0).model_copy(update={"teacher": TeacherConfig(structure_weight=1)})
+    straight, mirrored = (
+        SnippetDraws(
+            [recording], config.model_copy(update={"data": config.data.model_copy(update={"flip": flip})}), 4
+        ).draw(0)
+        for flip in (0.0, 1.0)
+    )
+    height, width = straight["target"].shape[-2:]
+    nearer = recording.camera.resized(width, height).fy / height / FOCAL_LENGTH
+    poses = street.T_world_camera
+    motions = [snippet_motion(poses, first, 2) for first in range(len(poses) - 2)]
+    unit = street.camera_height_m * nearer
+    T_source_target = straight["T_source_target"].numpy()
+    assert any(np.allclose(T_source_target[:, :3, 3] * unit, T[:, :3, 3], atol=1e-4) for T in motions)
+    known = straight["least"] > 0
+    assert torch.equal(straight["least"][known], straight["most"][known]) and known.float().mean() > 0.5
     for name in ("least", "most", "target"):
         torch.testing.assert_close(mirrored[name], straight[name].flip(-1))
     signs = torch.tensor([-1.0, 1, 1])
     torch.testing.assert_close(mirrored["T_source_target"][:, :3, 3], straight["T_source_target"][:, :3, 3] * signs)
-    torch.testing.assert_close(
-        mirrored["T_source_target"][:, 0, 2], -straight["T_source_target"][:, 0, 2]
-    )  # the other way round
+
+
+def test_exact_labels_are_wanted_of_every_recording(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    config = experiment(sources=2).model_copy(update={"teacher": TeacherConfig(structure_weight=1)})
+    with pytest.raises(DataError, match=r"kitti_odometry/00 has none: simulate with --depth"):
+        SnippetDraws(discover(write_root(tmp_path, 6)), config, draws=4)
 
 
 def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from erfsfm.geometry.transforms import euler_to_rotation, pose_vector_to_matrix, transform_points, with_rotation
+from erfsfm.geometry.transforms import euler_to_rotation, pose_vector_to_matrix, transform_points
 
 ANGLES = [0.0, 1e-8, 1e-3, 1.0, math.pi / 2, math.pi - 1e-6, math.pi, 2 * math.pi, -2.5]
 
@@ -65,12 +65,3 @@ def test_gradients(angle: float) -> None:
     vector = torch.tensor([[0.1, 0.2, 0.3, angle, -angle, 0.5 * angle]], dtype=torch.float64, requires_grad=True)
     points = torch.randn(1, 3, 4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda v, p: transform_points(pose_vector_to_matrix(v), p), (vector, points))
-
-
-def test_with_rotation_replaces_measured_rotations_only() -> None:
-    T = pose_vector_to_matrix(torch.tensor([[1.0, 2.0, 3.0, 0.1, 0.2, 0.3], [4.0, 5.0, 6.0, 0.3, 0.2, 0.1]]))
-    R = torch.stack([torch.eye(3), torch.full((3, 3), torch.nan)])
-    replaced = with_rotation(T, R)
-    torch.testing.assert_close(replaced[0, :3, :3], torch.eye(3))
-    torch.testing.assert_close(replaced[0, :3, 3], T[0, :3, 3])
-    torch.testing.assert_close(replaced[1], T[1])

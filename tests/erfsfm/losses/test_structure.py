@@ -54,20 +54,12 @@ def test_on_a_level_road_every_level_of_the_networks_agrees_with_the_labels(size
         assert torch.allclose(shown[..., inside, :], full[..., inside, :], rtol=1e-5), f"level {level}"
 
 
-def test_the_scale_is_removed_first():
-    disparity = torch.full((1, 1, 4, 4), 0.25 * 3)
-    interval = bounds(0.24, 0.26)
-    log_scale = interval.log_scale(disparity)
-    assert log_scale.exp().item() == pytest.approx(3, rel=1e-2)
-    assert disagreement(disparity, interval, log_scale).item() == pytest.approx(0, abs=1e-4)
-
-
 def test_unbounded_pixels_affect_neither_loss_nor_gradients():
     disparity = torch.full((1, 1, 4, 4), 0.5, requires_grad=True)
     least, most = torch.zeros(1, 1, 4, 4), torch.full((1, 1, 4, 4), torch.inf)
     most[..., 0, 0] = 0.25  # something far: only bounded from above
     interval = Bounds(least, most)
-    distance = disagreement(disparity, interval, interval.log_scale(disparity))
+    distance = disagreement(disparity, interval, ZERO)
     assert distance.item() == pytest.approx(0.6931, abs=1e-4)
     distance.backward()
     assert disparity.grad is not None and torch.isfinite(disparity.grad).all()

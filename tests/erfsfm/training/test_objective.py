@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from erfsfm.config import ExperimentConfig, LossConfig, TeacherConfig, load_experiment
+from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective
@@ -289,36 +289,14 @@ def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> Non
     assert torch.equal(mixed.total, precise.total)
 
 
-def test_the_teacher_loss_is_zero_for_true_outputs_and_positive_for_wrong_ones(batch: SnippetBatch) -> None:
-    config = ExperimentConfig(
-        loss=LossConfig(photometric_weight=0, smoothness_weight=0),
-        teacher=TeacherConfig(rotation_weight=1, translation_weight=1, structure_weight=1, unit_weight=1),
-    )
-    vectors = torch.tensor([[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]).double()
-    height, width = batch.target.shape[-2:]
-    half = torch.full((2, 1, height, width), 0.5).double()
-    in_heights = vectors * torch.tensor([10.0] * 3 + [1] * 3)  # the networks' unit is ten camera heights
-    T_source_target = pose_vector_to_matrix(in_heights)[None].expand(2, 2, 4, 4)
-    right = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
-    outcome = evaluate(right, config, 0.5, vectors)
-    assert outcome.total.item() == pytest.approx(0, abs=1e-3)
-    for term, vector in {"translation": vectors * 2, "rotation": -vectors}.items():
-        assert evaluate(right, config, 0.5, vector).terms[term].item() > 0.1
-    # all twice as near: a wrong unit, which translations share
-    twice = evaluate(right, config, 1.0, vectors)
-    assert twice.terms["structure"].item() == pytest.approx(0, abs=1e-3)
-    assert twice.terms["unit"].item() == pytest.approx(math.log(2), rel=1e-3)
-    assert evaluate(right, config, 1.0, vectors * torch.tensor([0.5] * 3 + [1] * 3)).terms["translation"].item() < 1e-3
-
-
-def _many_views(networks: str = "both", **loss: Any) -> ExperimentConfig:
+def _taught(views: str = "many", networks: str = "both", **loss: Any) -> ExperimentConfig:
     return ExperimentConfig.model_validate(
         {
             "network": {"sources": 2},
             "loss": {"photometric_weight": 0, "smoothness_weight": 0} | loss,
             "training": {"networks": networks},
             "teacher": {
-                "views": "many",
+                "views": views,
                 "rotation_weight": 1,
                 "translation_weight": 1,
                 "structure_weight": 1,
@@ -328,14 +306,17 @@ def _many_views(networks: str = "both", **loss: Any) -> ExperimentConfig:
     )
 
 
-def test_many_views_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatch) -> None:
+@pytest.mark.parametrize("views", ["exact", "many"])
+def test_labels_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatch, views: str) -> None:
     vectors = torch.tensor([[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]).double()
     height, width = batch.target.shape[-2:]
     half = torch.full((2, 1, height, width), 0.5).double()
     T_source_target = pose_vector_to_matrix(vectors * torch.tensor([10.0] * 3 + [1] * 3))[None].expand(2, 2, 4, 4)
     right = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
-    assert evaluate(right, _many_views(), 0.5, vectors).total.item() == pytest.approx(0, abs=1e-3)
-    twice = evaluate(right, _many_views(), 1.0, vectors)
+    assert evaluate(right, _taught(views), 0.5, vectors).total.item() == pytest.approx(0, abs=1e-3)
+    for term, vector in {"translation": vectors * 2, "rotation": -vectors}.items():
+        assert evaluate(right, _taught(views), 0.5, vector).terms[term].item() > 0.1
+    twice = evaluate(right, _taught(views), 1.0, vectors)
     middle, half_width = math.sqrt(0.098 * 0.102), math.log(0.102 / 0.098) / 2
     assert twice.terms["structure"].item() == pytest.approx(math.log(0.2 / middle) - half_width / 2, rel=1e-3)
     assert twice.terms["translation"].item() == pytest.approx(0, abs=1e-3)  # the unit is not the depth's
@@ -347,7 +328,7 @@ def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, 
     shape = (2, 1, *batch.target.shape[-2:])
     unbounded = Bounds(torch.zeros(shape).double(), torch.full(shape, torch.inf).double())
     labelled = replace(batch, T_source_target=T_source_target, bounds=unbounded)
-    config = _many_views("depth", photometric_weight=1)
+    config = _taught("many", "depth", photometric_weight=1)
     right = evaluate(labelled, config, 1 / plane.distance, torch.zeros(2, 6).double()).terms["photometric"].item()
     wrong = evaluate(labelled, config, 1.3 / plane.distance, torch.zeros(2, 6).double()).terms["photometric"].item()
     assert right < 0.5 * wrong

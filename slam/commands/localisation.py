@@ -26,7 +26,7 @@ from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.structure import PlaceStructure
-from slam.loops.verification import OF_KEYFRAMES, LoopThresholds, matches
+from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import CONFIG, PLACES
@@ -164,7 +164,7 @@ class Localiser:
             intrinsics: of the new images; None for those of the run, with images resized to it.
         """
         self._places = places
-        self._thresholds = replace(LoopThresholds.of_frames(config), max_hamming=OF_KEYFRAMES.max_hamming)
+        self._thresholds = replace(OF_FRAMES, max_hamming=OF_KEYFRAMES.max_hamming)
         self._resizes = intrinsics is None
         self._intrinsics = intrinsics or places.intrinsics
         self._features = FeatureExtractor(self._intrinsics)

@@ -16,9 +16,6 @@ class VisualOdometryConfig(Section):
     """Relative poses from tracked corners, see ``frontend/visual/odometry.py``."""
 
     enabled: bool = Field(default=True, description="measure relative poses by image geometry")
-    max_corners: int = Field(default=800, ge=50, le=10000, description="largest number of tracked corners")
-    corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners, pixels")
-    min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
 
 
 class RoadConfig(Section):
@@ -36,7 +33,6 @@ class KeyframesConfig(Section):
         default="auto",
         description="auto: unless a camera height is known or the first steps are a vehicle's; never: steps only",
     )
-    max_corners: int = Field(default=500, ge=50, le=10000, description="largest number of corners of a keyframe")
 
 
 class GapsConfig(Section):

@@ -125,42 +125,20 @@ class LoopsConfig(Section):
 
     enabled: bool = Field(default=True, description="detect and close loops")
     frame_stride: int = Field(default=4, ge=1, description="frames between those that are described and compared")
-    min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
 
 
 class MappingConfig(Section):
     """The map, see ``docs/design/map.md``. Without metres, all lengths here follow the depth of the scene."""
 
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
-    frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
     keyframe_distance_m: float = Field(default=1.5, ge=0, description="distance between keyframes, metres")
-    width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel, metres")
     truncation_voxels: float = Field(
         default=10.0, ge=1, description="truncation distance of the signed distance, voxels"
     )
-    sky_brightness: int = Field(
-        default=245,
-        ge=1,
-        le=256,
-        description="least level of all colours of sky, above the horizon and connected to the upper border",
-    )
-    sky_blueness: int = Field(
-        default=15, ge=1, le=256, description="or least blue less red of such a pixel, grey levels; 256: off"
-    )
     depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth, metres")
-    depth_max_m: float = Field(default=20.0, gt=0, description="largest fused depth, metres")
-    certain_sigma_m: float = Field(
-        default=1.2, ge=0, description="largest sigma of depth that is fused beyond depth_max_m, metres"
-    )
-    certain_range_factor: float = Field(
-        default=1.4, ge=1, description="such depth is fused up to this multiple of depth_max_m"
-    )
-    border: float = Field(
-        default=0.02,
-        ge=0,
-        lt=0.5,
-        description="width of the left, right and upper border that is left out, over the image's width",
+    depth_max_m: float = Field(
+        default=20.0, gt=0, description="largest fused depth, metres; up to 1.4 times that where it is certain"
     )
     hood_crop: float = Field(
         default=0.0,
@@ -168,36 +146,23 @@ class MappingConfig(Section):
         lt=1,
         description="height of the lower part with the car's own hood that is left out, over the image's height",
     )
-    max_depth_step: float = Field(
-        default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
-    )
-    max_depth_difference: float = Field(
-        default=0.1, gt=0, description="largest relative difference to the depth of a neighbouring keyframe"
-    )
     max_relative_sigma: float = Field(default=0.3, gt=0, description="largest sigma of fused depth, over the depth")
-    min_weight: float = Field(
-        default=1.0, ge=0, description="least number of observations of a voxel that becomes surface"
-    )
-    min_component_triangles: int = Field(
-        default=300, ge=0, description="least number of triangles of a connected piece of the mesh"
-    )
     close_holes_m: float = Field(
         default=1.5, ge=0, description="largest diameter of a hole of the road that is closed, metres"
     )
-    submap_m: float = Field(default=60.0, gt=0, description="length of the road in a submap, metres")
     memory_mb: int = Field(
-        default=1000, ge=100, description="memory of the map, MiB; a submap that would need more ends before submap_m"
+        default=1000, ge=100, description="memory of the map, MiB; a submap ends before it takes more"
     )
+
+    @property
+    def reach_m(self) -> float:
+        """Depth up to which anything is fused: where its sigma is small, beyond ``depth_max_m``."""
+        return 1.4 * self.depth_max_m
 
     def in_unit(self, per_metre: float) -> MappingConfig:
         """The same lengths in a unit of which a metre has ``per_metre``."""
         lengths = {name: per_metre * getattr(self, name) for name in type(self).model_fields if name.endswith("_m")}
         return self.model_copy(update=lengths)
-
-    @property
-    def reach_m(self) -> float:
-        """Depth up to which anything is fused."""
-        return self.depth_max_m * self.certain_range_factor
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:

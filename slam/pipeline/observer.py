@@ -112,7 +112,7 @@ class Observer:
         self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
         self.drive = Drive()  # the measurements so far
         self._gate = ImageGate()
-        self._odometry = VisualOdometry(config.visual_odometry, intrinsics, seed)
+        self._odometry = VisualOdometry(intrinsics, seed)
         self._keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
         )
@@ -394,9 +394,8 @@ class Observer:
 
     def _keep_for_map(self, frame: Frame, depth: DepthMap) -> None:
         """Keep a thinned frame for the map."""
-        mapping = self._config.mapping
-        if mapping.enabled and frame.index % mapping.frame_stride == 0:
-            keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
+        if self._config.mapping.enabled:
+            keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file)
             self._tasks.append(Task("map", keyframe, self.drive.keyframes.append))
 
     def _finish_tasks(self, stage: str | None = None) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from erfsfm.mvs.fusion import DepthFusion
-from slam.config.sections import MappingConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
@@ -24,7 +23,7 @@ def depths(step: float, guess_sigma: float | None, refined: bool = True) -> Keyf
     frames = [Frame(k, float(k), rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)) for k in range(FRAMES)]
     wall = np.full((32, 64), 2.5, np.float32)
     drive = Drive(
-        keyframes=[Keyframe.of(frame, wall, spill_file, MappingConfig()) for frame in frames],
+        keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames],
         roads=[MeasurementFailure("no road")] * FRAMES,
     )
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))

@@ -108,12 +108,12 @@ def oracle_of(sequence: Damaged, rows: Sequence[int] = range(FRAMES)) -> OracleP
 
 
 def config_with(*overrides: str) -> SlamConfig:
-    return load_config(None, ["visual_odometry.corner_spacing_px=4", "visual_odometry.min_inliers=20", *overrides])
+    return load_config(None, overrides)
 
 
 def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> Estimate:
     sequence = Damaged(street(), damage, bad)
-    return SlamPipeline(sequence, oracle_of(sequence), config_with("mapping.width_px=104", *overrides)).run()
+    return SlamPipeline(sequence, oracle_of(sequence), config_with(*overrides)).run()
 
 
 @functools.cache

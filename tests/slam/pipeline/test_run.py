@@ -21,6 +21,7 @@ from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, SnippetPoses
+from slam.frontend import drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
@@ -292,7 +293,7 @@ def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
 def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     noise = OracleNoise(np.deg2rad(0.3))
-    options = ("visual_odometry.enabled=true", "visual_odometry.corner_spacing_px=3", "visual_odometry.min_inliers=20")
+    options = ("visual_odometry.enabled=true",)
     result = run(still, *options, noise=noise)
     assert {factor.source for factor in result.drive.steps.relative_poses} == {STILL_SOURCE}
     rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
@@ -326,13 +327,7 @@ def drive_street(
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
-    overrides = [
-        "visual_odometry.corner_spacing_px=4",
-        "visual_odometry.min_inliers=20",
-        f"scale.mode={mode}",
-        f"depth.frame_stride={stride}",
-    ]
-    settings = load_config(None, overrides)
+    settings = load_config(None, [f"scale.mode={mode}", f"depth.frame_stride={stride}"])
     return SlamPipeline(street, oracle, settings, progress).run()
 
 
@@ -383,9 +378,9 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt)
     assert result.map.statistics().triangles > 5000
 
 
-def test_mapping_thins_frames_and_can_be_left_out(street: Excerpt) -> None:
+def test_depth_is_thinned_for_the_map(street: Excerpt, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drive, "MAP_WIDTH_PX", 104)
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
-    settings = load_config(None, ["mapping.frame_stride=5", "mapping.width_px=104", "visual_odometry.enabled=false"])
+    settings = load_config(None, ["visual_odometry.enabled=false"])
     seen = SlamPipeline(street, oracle, settings).run().drive
-    assert [keyframe.index for keyframe in seen.keyframes] == [0, 5, 10, 15, 20]
     assert seen.keyframes[0].image.shape == (32, 104, 3) and seen.keyframes[0].depth_unscaled.shape == (32, 104)

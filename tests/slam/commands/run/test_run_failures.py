@@ -147,7 +147,7 @@ def test_a_run_that_breaks_off_has_its_reason_and_is_replaced(
 @pytest.mark.slow
 def test_a_disk_that_is_full_at_the_map(kitti_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     overrides = ["visual_odometry.enabled=false", "output.report=false", "loops.enabled=false"]
-    overrides += ["mapping.voxel_size_m=0.1", "mapping.submap_m=3", "depth.refine=none"]
+    overrides += ["mapping.voxel_size_m=0.1", "depth.refine=none"]
     arguments = ["run", "--dataset", kitti_root, "--weights", "sim", "--frames", "0:7"]
     arguments += [word for override in overrides for word in ("--set", override)]
     whole, full = tmp_path / "whole", tmp_path / "full"

@@ -6,9 +6,8 @@ import json
 import logging
 import shlex
 import sys
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -41,6 +40,7 @@ UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 
 @app.command()
 def run(
+    context: typer.Context,
     dataset: Annotated[
         Path | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
     ] = None,
@@ -68,25 +68,7 @@ def run(
     from slam.commands.run.run import perform
 
     with progress_bar() as progress:
-        folder = perform(
-            RunRequest(
-                dataset=dataset,
-                sequence=sequence,
-                camera=camera,
-                weights=weights,
-                config=config,
-                overrides=overrides,
-                frames=frames,
-                truth=truth,
-                output=output,
-                rerun=rerun,
-                gps=gps,
-                seed=seed,
-                device=device,
-                progress=progress,
-                command=_command(),
-            )
-        )
+        folder = perform(RunRequest.of(**_given(context), progress=progress))
     if as_json:
         typer.echo(folder.metrics().to_json())
     else:
@@ -95,6 +77,7 @@ def run(
 
 @app.command()
 def live(
+    context: typer.Context,
     dataset: Annotated[str, typer.Option(help="number of a camera, address of a stream, video, or folder")],
     camera: Camera = None,
     every_frame: Annotated[
@@ -113,23 +96,9 @@ def live(
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.run import LiveRequest, run_live, write_line
+    from slam.commands.live.run import LiveRequest, run_live
 
-    request = LiveRequest(
-        dataset=dataset,
-        camera=camera,
-        every_frame=every_frame,
-        output=output,
-        view=view,
-        wait=wait,
-        weights=weights,
-        config=config,
-        overrides=overrides,
-        seed=seed,
-        device=device,
-        command=_command(),
-    )
-    folder = run_live(request, partial(write_line, sys.stdout))
+    folder = run_live(LiveRequest.of(**_given(context)), lambda message: typer.echo(json.dumps(message)))
     typer.echo(f"everything in {folder.path}", err=True)
 
 
@@ -463,8 +432,10 @@ def _print_run(folder: RunFolder) -> None:
     )
 
 
-def _command() -> str:
-    return shlex.join(["erfsfm-slam", *sys.argv[1:]])
+def _given(context: typer.Context) -> dict[str, Any]:
+    """The options of a verb by name, and the whole command."""
+    options = {name: value for name, value in context.params.items() if name != "as_json"}
+    return options | {"command": shlex.join(["erfsfm-slam", *sys.argv[1:]])}
 
 
 def main() -> None:

@@ -45,7 +45,7 @@ class Reader:
     def __init__(
         self, source: Source, most_wait_s: float, prepare: Callable[[Image], Image], every_frame: bool = False
     ) -> None:
-        """Start to read.
+        """Prepare to read; the thread begins with the iteration.
 
         Args:
             source: is read until it ends, dies, or sends nothing for ``most_wait_s``.
@@ -60,9 +60,9 @@ class Reader:
         self._reason: str | None = None
         self._changed, self._stopped = Condition(), Event()
         self._thread = Thread(target=self._read, name="reader", daemon=True)
-        self._thread.start()
 
     def __iter__(self) -> Iterator[Arrival]:
+        self._thread.start()
         while (arrival := self._take()) is not None:
             yield Arrival(arrival.stamp, self._prepare(arrival.image), arrival.at_s)
 
@@ -79,7 +79,8 @@ class Reader:
     def close(self) -> None:
         """Stop, and wait for the thread: one that still decodes an image when the process ends would abort it."""
         self.stop()
-        self._thread.join(_LAST_IMAGE_S)
+        if self._thread.is_alive():
+            self._thread.join(_LAST_IMAGE_S)
 
     def _take(self) -> Arrival | None:
         with self._changed:
@@ -120,7 +121,7 @@ class StreamedSequence(GrowingSequence):
     def __init__(
         self, name: str, source: Source, camera: CameraFile, most_wait_s: float, every_frame: bool = False
     ) -> None:
-        """Begin to read.
+        """Prepare to read.
 
         Raises:
             SequenceError: every frame is wanted of a source that does not wait.

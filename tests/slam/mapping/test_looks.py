@@ -46,7 +46,8 @@ def test_brightness_steps_become_small_gains():
     assert len(evened(np.array([np.nan]))) == 1
 
 
-def test_a_hole_of_the_road_is_closed_and_marked(street_map):
+def test_a_hole_of_the_road_is_closed_and_marked(street_map, monkeypatch):
+    monkeypatch.setattr(surface, "_LEAST_WEIGHT", 2.0)
     whole = street_map(hidden=True, close_holes_m=4.0)
     mesh = whole.mesh()
     filled = mesh.vertices["filled"] > 0

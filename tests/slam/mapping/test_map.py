@@ -85,6 +85,7 @@ def test_one_wall_lands_where_the_camera_saw_it():
 
 def test_thinned_keyframes_keep_the_geometry(monkeypatch):
     monkeypatch.setattr(drive, "MAP_WIDTH_PX", 70)
+    monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 10)
     spill_file = SpillFile()
     thinned = CAMERA.resized(70, round(CAMERA.height * 70 / CAMERA.width))
     tsdf_map = TsdfMap(MappingConfig(), thinned)

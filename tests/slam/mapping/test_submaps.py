@@ -4,13 +4,13 @@ from collections import Counter
 
 import numpy as np
 
-from slam.mapping import map, surface
+from slam.mapping import surface
 from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS
 
 
 def test_submaps_merge_to_the_surface_of_one(street_map, monkeypatch):
     one = street_map()
-    monkeypatch.setattr(map, "_SUBMAP_LENGTH", 3.0 / 20.0)
+    monkeypatch.setattr("slam.mapping.map._SUBMAP_LENGTH", 3.0 / 20.0)
     many = street_map()
     assert one.statistics().submaps == 1 and many.statistics().submaps >= 5
     assert many.statistics().frames_fused == 18 and many.statistics().frames_left_out == 0

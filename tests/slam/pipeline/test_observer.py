@@ -7,7 +7,7 @@ import logging
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -97,6 +97,14 @@ def street() -> SimulatedSequence:
     # every run needs image and depth of every frame
     sequence.street.render = functools.lru_cache(FRAMES)(sequence.street.render)
     return sequence
+
+
+@pytest.fixture(autouse=True, scope="module")
+def close_corners() -> Iterator[None]:
+    """Images of the test are small."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("slam.frontend.tracking.CORNER_SPACING_PX", 4.0)
+        yield
 
 
 def oracle_of(sequence: Damaged, rows: Sequence[int] = range(FRAMES)) -> OraclePredictor:

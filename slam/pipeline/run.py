@@ -69,11 +69,8 @@ class Recorder:
     def keyframe(self, keyframe: KeyframeDepth) -> None:
         """The depth of each keyframe that is fused."""
 
-    def map(self, estimate: Estimate) -> None:
-        """The same with its map, which is None where mapping is switched off, or no frame has depth."""
-
-    def no_map(self, reason: str) -> None:
-        """An error cost the map."""
+    def map(self, estimate: Estimate | Failed) -> None:
+        """The estimate with its map, None where mapping is switched off or no frame has depth; or what cost the map."""
 
 
 class SlamPipeline:
@@ -133,10 +130,10 @@ class SlamPipeline:
         self._progress("loops and graph", 1, 1)
         recorder.estimate(estimate)
         mapped = attempt("the map", lambda: self._mapped(estimate, recorder))
-        if isinstance(mapped, Estimate):
-            return mapped
-        recorder.no_map(mapped.reason)
-        return estimate
+        if isinstance(mapped, Failed):
+            recorder.map(mapped)
+            return estimate
+        return mapped
 
     def solve(self, observed: Observations, recorder: Recorder) -> Estimate:
         """Lengths, factors and loops of a drive, and the trajectory that fits them.

@@ -187,14 +187,18 @@ def evaluate(
 @app.command()
 def export(
     run: Annotated[Path, typer.Argument(help="a run folder")],
-    what: Annotated[str, typer.Option(help="mesh, cloud, colmap, nerfstudio or occupancy")],
+    what: Annotated[
+        Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"], typer.Option(help="the part of the run")
+    ],
     output: Annotated[Path, typer.Option(help="the file to write; for colmap and nerfstudio a folder")],
-    up: Annotated[str, typer.Option(help="axes of the world: y-down (camera axes) or z")] = "y-down",
-    resolution: Annotated[float | None, typer.Option(help="side of a cell of an occupancy grid; default 0.1")] = None,
+    up: Annotated[
+        Literal["y-down", "z"], typer.Option(help="axes of the world: those of the camera, or z up")
+    ] = "y-down",
+    resolution: Annotated[float, typer.Option(min=1e-6, help="side of a cell of an occupancy grid")] = 0.1,
     dataset: Annotated[
         Path | None, typer.Option(help="where the images of the run are now, for colmap and nerfstudio")
     ] = None,
-    points: Annotated[int | None, typer.Option(help="at most so many points of a COLMAP model")] = None,
+    points: Annotated[int | None, typer.Option(min=1, help="at most so many points of a COLMAP model")] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
 ) -> None:
@@ -238,21 +242,17 @@ def localize(
 
     Example: erfsfm-slam localize photos --map results/latest --output photos.tum
     """
-    from slam.commands.localisation import image_numbers, localisation_table, localise, write_localisations
+    from slam.commands.localisation import localisation_table, localise, write_localisations
     from slam.results.folder import RunFolder
     from slam.results.output_file import check_replaced_trajectory
 
     run_folder = RunFolder.open(map)
     if output is not None:
         check_replaced_trajectory(output)
-    numbers = image_numbers(images, frames, every)
-    found = []
     with progress_bar() as progress:
-        for localisation in localise(images, run_folder, camera, numbers):
-            found.append(localisation)
-            progress("images", len(found), len(numbers))
+        found = localise(images, run_folder, camera, frames, every, progress)
     if output is not None:
-        write_localisations(output, found, numbers)
+        write_localisations(output, found)
     if as_json:
         typer.echo(json.dumps([each.tree() for each in found], indent=2))
         return

@@ -5,7 +5,7 @@ A YAML file may leave keys out, which then have their defaults; ``configs/slam/d
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -207,21 +207,7 @@ def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str]
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.
     """
-    return _load(file_or_name, overrides)
-
-
-def load_stored(path: Path, *sections: str) -> SlamConfig:
-    """Sections of the configuration that a run has kept; the others, which are not read, have their defaults.
-
-    A run of an earlier release may have keys that are gone: they are left out. Raises as `load_config`.
-    """
-    return _load(path, (), sections)
-
-
-def _load(
-    file_or_name: str | Path | None, overrides: Sequence[str], sections: Collection[str] | None = None
-) -> SlamConfig:
     try:
-        return load_tree(SlamConfig, file_or_name, overrides, _SHIPPED, sections)
+        return load_tree(SlamConfig, file_or_name, overrides, _SHIPPED)
     except erfsfm.common.errors.ConfigError as error:
         raise ConfigError(str(error)) from error

@@ -5,7 +5,6 @@ from __future__ import annotations
 import resource
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -78,11 +77,9 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
     ("what", "name", "up", "why"),
     [
         ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
-        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, colmap, nerfstudio, occupancy"),
         ("mesh", "out.stl", "y-down", r"written as \.ply; got 'out\.stl'"),
         ("occupancy", "out.png", "z", r"written as \.yaml or \.pgm"),
         ("nerfstudio", "file", "z", "is a file: a scene is several files"),
-        ("mesh", "out.ply", "x", "y-down or z"),
         ("mesh", "folder.ply", "y-down", "is a folder"),
         ("cloud", "file/out.ply", "y-down", "cannot be written"),
     ],
@@ -173,22 +170,10 @@ def test_open3d_reads_the_same_mesh(make_recorded: MakeRun, sheet: Ply, tmp_path
     np.testing.assert_allclose(np.asarray(mesh.vertex_colors), sheet.colours / 255.0, atol=1 / 255)
 
 
-@pytest.mark.parametrize(
-    ("what", "options", "why"),
-    [
-        ("colmap", {"points": 0}, "--points 0 is too few"),
-        ("mesh", {"dataset": Path("x")}, "--dataset does nothing for mesh: it is for colmap, nerfstudio"),
-        ("occupancy", {"resolution": float("nan")}, "must be a positive length"),
-        ("occupancy", {"resolution": 1e-5}, "--resolution 1e-05 gives .* cells"),
-    ],
-)
-def test_options_without_sense_are_one_line_and_leave_nothing(
-    make_recorded: MakeRun, tmp_path: Path, what: str, options: dict[str, Any], why: str
-) -> None:
-    name = "model" if what == "colmap" else "map.yaml" if what == "occupancy" else "map.ply"
-    with pytest.raises(RunError, match=why) as caught:
-        export(make_recorded(), what, tmp_path / "new" / name, "y-down", **options)
-    assert "\n" not in str(caught.value) and not (tmp_path / "new").exists()
+def test_a_grid_of_too_many_cells_is_one_line(make_recorded: MakeRun, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"--resolution 1e-05 gives .* cells"):
+        export(make_recorded(), "occupancy", tmp_path / "new" / "map.yaml", resolution=1e-5)
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import pytest
 
-from slam.commands.batch import Drive, check_output, drives_of, run_drive, run_drives
+from slam.commands.batch import check_output, drives_of, run_drive, run_drives
 from slam.commands.cli import main
 from slam.commands.cluster import workers
-from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.runtime.errors import RunError, SequenceError
 
 CommandLine = Callable[..., tuple[int, str, str]]
 QUICK = ["--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false"]
@@ -174,18 +174,6 @@ def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path) -> None:
         results = dict(spread(dies_once, [tmp_path / str(n) for n in range(5)]))
     assert isinstance(results.pop(2), ValueError)
     assert results == {0: "0", 1: "1", 3: "3", 4: "4"}
-
-
-def test_an_error_of_the_engine_is_the_drives_reason(tmp_path: Path) -> None:
-    drive = Drive("a", tmp_path / "gone", ())
-    (outcome,) = run_drives([drive], tmp_path / "out", 1, None, silent)
-    assert outcome.status == "failed" and outcome.reason.startswith("FileNotFoundError")
-
-
-def test_many_workers_need_dask(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(SlamError, match=r"erfsfm-slam\[cluster\]"), workers(2):
-        pass
 
 
 def test_a_drive_ends_with_its_worker(tmp_path: Path) -> None:

@@ -203,15 +203,6 @@ def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
         feed(slam, 0, 2)
 
 
-def test_a_trajectory_belongs_to_the_caller() -> None:
-    slam = started(load_config(None, SETTINGS))
-    feed(slam, 0, 2)
-    slam.trajectory().stamps[:] = 1e9
-    slam.trajectory().T_world_camera[:] = np.nan
-    feed(slam, 2, 4)
-    assert np.isfinite(slam.trajectory().T_world_camera).all()
-
-
 class Failing(OraclePredictor):
     """An oracle that fails at one frame, at its depth or at the snippet that ends with it, each time."""
 
@@ -255,13 +246,6 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     reference = drive().reference
     assert reference is not None
     assert np.linalg.norm(trajectory.positions[-1]) > 0.5 * np.linalg.norm(reference[19, :3, 3])
-
-
-def test_a_failure_at_the_last_frame_is_a_gap() -> None:
-    slam = Slam(Failing(8, "snippet"), drive().intrinsics, load_config(None, SETTINGS), drive().camera_height_m)
-    with slam:
-        feed(slam, 0, 9)
-        assert len(slam.trajectory()) == len(slam) == 9
 
 
 def test_a_closed_session_has_no_threads_and_keeps_its_results() -> None:

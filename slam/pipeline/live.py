@@ -135,7 +135,7 @@ class Slam:
             raise ValueError(f"image must be {size} uint8; got {shape} {getattr(image, 'dtype', type(image).__name__)}")
         since = stamp - self._sequence.stamps[-1] if len(self) else POSSIBLE_PERIODS_S[1]
         if not (np.isfinite(stamp) and 0 < since <= POSSIBLE_PERIODS_S[1]):
-            raise ValueError(f"stamps must be seconds that increase; got {stamp} after {self._sequence.stamps[-1:]}")
+            raise ValueError(f"stamps must increase, in seconds; got {stamp} after {self._sequence.stamps[-1:]}")
         image = image.copy()  # used again with the next one
         image.setflags(write=False)
         index = len(self)

@@ -6,16 +6,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Condition, Event, Thread
 
 import numpy as np
 
-from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.camera_file import CameraFile
 from slam.commands.live.source import Source
 from slam.frames import Frame, Image
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.recording import GrowingSequence
 from slam.sequences.undistortion import Undistortion, intrinsics_of
 
@@ -147,20 +145,3 @@ class StreamedSequence(GrowingSequence):
             self.arrivals = {k: v for k, v in self.arrivals.items() if k >= index - 2} | {index: arrival}
             arrival.image.setflags(write=False)
             yield Frame(index, arrival.stamp, arrival.image)
-
-
-def calibration_of(camera: str, given: Path | None, source: Source) -> CameraFile:
-    """The calibration given, or the ``camera.yaml`` beside a folder or a video.
-
-    Raises:
-        SequenceError: there is none.
-    """
-    if given is not None:
-        return explicit_camera(given, source, source.fps)
-    path = Path(camera)
-    places = (path, path.absolute().parent) if path.is_dir() else (path.absolute().parent,) if path.is_file() else ()
-    found = beside(*places)
-    if found is None:
-        looked = f"; no {CAMERA_FILE} is in {' or '.join(map(str, places))}" if places else ""
-        raise SequenceError(f"{camera} needs its calibration: give --camera {CAMERA_FILE} or fov=70{looked}")
-    return found

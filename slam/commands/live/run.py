@@ -14,7 +14,7 @@ import numpy as np
 
 from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import raising_on_termination
-from slam.commands.live.reader import EXPECTED, StreamedSequence, calibration_of
+from slam.commands.live.reader import EXPECTED, StreamedSequence
 from slam.commands.live.source import open_source
 from slam.commands.run.recorder import FolderRecorder
 from slam.commands.run.request import Request
@@ -35,7 +35,7 @@ from slam.results.output_folder import check_output
 from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
-from slam.sequences.camera_file import as_known
+from slam.sequences.camera_file import as_known, find_camera_file
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +73,9 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
         source = open_source(request.dataset, request.wait)
-        camera = calibration_of(request.dataset, request.camera, source)
+        path = Path(request.dataset).absolute()
+        folders = (path, path.parent) if path.exists() else ()
+        camera = find_camera_file(request.camera, *folders, wanted_by=request.dataset, images=source, fps=source.fps)
         source.fps, name = camera.fps, Path(request.dataset).stem or "live"
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
         sequence.intrinsics = as_known(sequence.intrinsics, request.camera)

@@ -78,18 +78,6 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     assert content["fl_x"] == camera.fx and content["k1"] == 0
 
 
-def test_nothing_of_a_scene_before_stays(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    written = export(folder, "nerfstudio", tmp_path / "scene")
-    (written / "images" / "mine.png").write_text("not of an export")
-    (tmp_path / "drive" / "03.png").write_text("broken")
-    (folder.path / "map_cloud.ply").unlink()
-    export(folder, "nerfstudio", written)
-    names = [Path(frame["file_path"]).name for frame in scene(written)["frames"]]
-    assert sorted(path.name for path in (written / "images").iterdir()) == sorted([*names, "mine.png"])
-    assert len(names) == 7 and not (written / "points.ply").exists()
-
-
 def test_frames_without_a_usable_image_are_left_out(
     make_recorded: MakeRecorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

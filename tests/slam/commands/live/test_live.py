@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live.reader import Reader, StreamedSequence, calibration_of
+from slam.commands.live.reader import Reader, StreamedSequence
 from slam.commands.live.run import LiveRequest, run_live
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
@@ -364,9 +364,7 @@ def test_the_viewer_is_shown_the_drive(
 
 def test_a_video_plays_at_its_own_speed(video: Path) -> None:
     source = VideoSource(str(video), 0.1)
-    assert calibration_of(str(video), Path("fov=70"), source).fps == 20.0
-    with pytest.raises(SequenceError, match=r"give --camera camera\.yaml or fov=70; no camera\.yaml is in"):
-        calibration_of(str(video), None, source)
+    assert source.fps == 20.0
     stamps = [stamp for stamp, _ in source.images(Event())]
     np.testing.assert_allclose(stamps, np.arange(8) / 20.0)
     assert (source.width, source.height) == (32, 24)

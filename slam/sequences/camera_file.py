@@ -69,8 +69,8 @@ def find_camera_file(
     places = " and ".join(dict.fromkeys(str(folder) for folder in folders))
     looked = f"looked in {places}; put one there or " if places else ""
     raise SequenceError(
-        f"no {CAMERA_FILE} for {wanted_by}: {looked}give it with --camera (width, height, fx, fy, cx, cy, fps), or give "
-        "the horizontal field of view in degrees, --camera fov=70"
+        f"no {CAMERA_FILE} for {wanted_by}: {looked}give it with --camera (width, height, fx, fy, cx, cy, fps), or "
+        "give the horizontal field of view in degrees, --camera fov=70"
     )
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import threading
-import weakref
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,6 @@ from oracle import OracleNoise, OraclePredictor
 
 from erfsfm.common.errors import SHOW_TRACEBACK
 from erfsfm.common.progress import Progress, silent
-from erfsfm.inference import DepthPosePredictor
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
@@ -28,7 +25,6 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
-from slam.prediction.assembly import NetworkPredictor
 from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import Excerpt
@@ -242,24 +238,6 @@ def threads(before: Collection[threading.Thread]) -> set[str]:
     prefixes = ("networks", "oracle", "beside", "ahead", "side")
     alive = (thread for thread in threading.enumerate() if thread not in before)
     return {thread.name for thread in alive if thread.name.startswith(prefixes)}
-
-
-def test_a_result_holds_neither_threads_nor_networks(tiny_weights: Path) -> None:
-    street = SimulatedSequence(SimulationOptions("straight", 9, 1002, 208, 64))
-    networks = DepthPosePredictor.from_weights(tiny_weights)
-    predictor = NetworkPredictor(networks, street.intrinsics)
-    during: set[str] = set()
-    before = threading.enumerate()  # other tests may have left some
-    pipeline = SlamPipeline(
-        street, predictor, load_config(None, ["mapping.enabled=false"]), lambda *_: during.update(threads(before))
-    )
-    result = pipeline.run()
-    assert {"networks_0", "beside_0"} <= during and threads(before) == set()
-    alive = weakref.ref(predictor), weakref.ref(networks)
-    del pipeline, predictor, networks
-    gc.collect()
-    assert [each() for each in alive] == [None, None]
-    assert len(result.optimised) == 9
 
 
 def test_threads_end_where_a_run_fails() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PositiveFloat, field_validator, model_validator
 
 import erfsfm.common.errors
 from erfsfm.common.config_tree import Section, dump_explained
@@ -51,7 +51,7 @@ class DepthConfig(Section):
         default=None,
         description="onnx: mean of RGB in [0, 1], which is subtracted; null for ONNX files of erfsfm export",
     )
-    std: tuple[float, float, float] | None = Field(
+    std: tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None = Field(
         default=None, description="onnx: standard deviation, by which RGB less the mean is divided; null likewise"
     )
     height: int = Field(default=0, ge=0, description="onnx: height of the input; 0 if the file fixes it")
@@ -86,13 +86,6 @@ class DepthConfig(Section):
         if not (kind in others and colon and path):
             raise ValueError(", ".join(("network, onnx:FILE, npy:FOLDER or png:FOLDER", *(f"{n}:..." for n in others))))
         return source
-
-    @field_validator("std")
-    @classmethod
-    def _positive(cls, std: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if std is not None and min(std) <= 0:
-            raise ValueError("three numbers above 0")
-        return std
 
 
 class VisualOdometryConfig(Section):

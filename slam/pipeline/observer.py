@@ -152,7 +152,7 @@ class Observer:
         if index % 200 == 0:  # 24 MB
             return_freed_memory()
         if isinstance(frame, SequenceError):
-            is_missing = isinstance(frame, MissingFrameError) and self._config.gaps.enabled  # of a recording: no limit
+            is_missing = isinstance(frame, MissingFrameError) and self._config.gaps.enabled  # never ends a run
             self._unread += not is_missing
             if not (is_missing or self._is_gap(self._unread)):
                 raise frame

@@ -21,9 +21,6 @@ from slam.runtime.run_files import PLACES
 MakeRun = Callable[..., RunFolder]
 
 
-R_UP_WORLD = R_UP_WORLDS["z"]
-
-
 @pytest.mark.parametrize("what", ["mesh", "cloud"])
 def test_ply_is_written_as_it_is_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
     folder = make_run()

@@ -28,13 +28,13 @@ _MAP_ERRORS = {
 }
 _FILTERS = {
     "unknown": "no depth",
-    "border": "left, right and upper border of the image (mapping.border)",
+    "border": "left, right and upper border of the image",
     "bonnet": "lower border, the car's own hood (mapping.hood_crop)",
-    "sky": "bright or blue above the horizon (mapping.sky_brightness, mapping.sky_blueness)",
-    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m, mapping.certain_range_factor)",
+    "sky": "bright or blue above the horizon",
+    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m)",
     "sigma": "refined depth too uncertain (mapping.max_relative_sigma)",
-    "edge": "at a step of depth (mapping.max_depth_step)",
-    "agreement": "the keyframe before does not agree (mapping.max_depth_difference)",
+    "edge": "at a step of depth",
+    "agreement": "the keyframe before does not agree",
     "moving": "a keyframe before saw what is behind",
 }
 _TRUTHS = {
@@ -156,7 +156,7 @@ def map_left_out(metrics: Metrics) -> Table | None:
         return None
     shares = {name: (share, _FILTERS.get(name, "")) for name, share in filters.items()}
     shares["fused"] = (1.0 - sum(filters.values()), "what the filters left")
-    loose = "of the mesh: small loose pieces, left out (mapping.min_component_triangles)"
+    loose = "of the mesh: small loose pieces, left out"
     double = "of the mesh's area: a parallel surface 0.3 to 2 m before it"
     for name, part, what in (
         ("floaters", metrics.map.floater_share, loose),

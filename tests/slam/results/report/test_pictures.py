@@ -8,17 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry.se3 import from_rotation_vector, invert
-from slam.loops.verification import Loop, LoopThresholds
+from slam.loops.verification import OF_FRAMES, Loop
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.page import Picture
 from slam.results.report.pictures import DepthPictures, loop_pictures
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
-
-THRESHOLDS = LoopThresholds.of_frames(LoopsConfig())
 
 
 def pixels(picture: Picture) -> NDArray[np.uint8]:
@@ -36,7 +33,7 @@ def test_lines_join_the_corners_that_fit_the_loop() -> None:
 
     def drawn(T: NDArray[np.float64]) -> NDArray[np.uint8]:
         loop = Loop(RelativePose(4, 6, T, np.full(6, 0.1), LOOP_SOURCE), 50, 0.9)
-        found = loop_pictures([loop], lambda index: images[(index - 4) // 2], street.intrinsics, THRESHOLDS)
+        found = loop_pictures([loop], lambda index: images[(index - 4) // 2], street.intrinsics, OF_FRAMES)
         assert [picture.title for picture in found] == ["Frames 4 and 6: 50 inliers"]
         return pixels(found[0])
 
@@ -45,7 +42,7 @@ def test_lines_join_the_corners_that_fit_the_loop() -> None:
     plain = np.vstack([cv2.resize(image[..., ::-1], (480, 148)) for image in images])
     changed = [(np.abs(shown.astype(int) - plain).max(axis=-1) > 60).mean() for shown in (right, wrong)]
     assert changed[0] > 4 * changed[1]
-    gone = loop_pictures([], lambda index: None, street.intrinsics, THRESHOLDS)
+    gone = loop_pictures([], lambda index: None, street.intrinsics, OF_FRAMES)
     assert gone == []
 
 

@@ -194,7 +194,9 @@ def export(
     up: Annotated[
         Literal["y-down", "z"], typer.Option(help="axes of the world: those of the camera, or z up")
     ] = "y-down",
-    resolution: Annotated[float, typer.Option(min=1e-6, help="side of a cell of an occupancy grid")] = 0.1,
+    resolution: Annotated[
+        float | None, typer.Option(min=1e-6, help="side of a cell of an occupancy grid, 0.1 by default")
+    ] = None,
     dataset: Annotated[
         Path | None, typer.Option(help="where the images of the run are now, for colmap and nerfstudio")
     ] = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -36,7 +36,8 @@ _SCENES = {
     "colmap": ("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), is_own_model),
     "nerfstudio": ("a scene", ("images", POINTS, TRANSFORMS), is_own_scene),
 }
-RESOLUTION = 0.1  # of an occupancy grid
+_TAKERS = {"resolution": ("occupancy",), "dataset": tuple(_SCENES), "points": ("colmap",)}
+_RESOLUTION = 0.1  # of an occupancy grid
 
 
 def export(
@@ -45,7 +46,7 @@ def export(
     output: Path,
     up: Up = "y-down",
     *,
-    resolution: float = RESOLUTION,
+    resolution: float | None = None,
     dataset: Path | None = None,
     points: int | None = None,
     progress: Progress = silent,
@@ -68,14 +69,19 @@ def export(
         What was written.
 
     Raises:
-        SlamError: a part that the run lacks or that is damaged, images that are not found, or a file that cannot be
-            written.
+        SlamError: an option unknown or without effect, a part that the run lacks or that is damaged, images that are not found, or
+            a file that cannot be written.
     """
+    if what not in get_args(What) or up not in R_UP_WORLDS:
+        raise RunError(f"what is one of {', '.join(get_args(What))}, up {' or '.join(R_UP_WORLDS)}; got {what}, {up}")
+    for name, value in {"resolution": resolution, "dataset": dataset, "points": points}.items():
+        if value is not None and what not in _TAKERS[name]:
+            raise RunError(f"--{name} does nothing for {what}: it is for {' and '.join(_TAKERS[name])}")
     _check_target(what, output)
     if what in _MAPS:
         write_ply(output, _map(folder, what, up))
     elif what == "occupancy":
-        return _export_occupancy(folder, output, resolution)
+        return _export_occupancy(folder, output, resolution or _RESOLUTION)
     else:
         trajectory = _trajectory(folder, up)
         cloud = _map(folder, "cloud", up) if (folder.path / MAP_CLOUD).is_file() else None

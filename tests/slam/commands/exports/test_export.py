@@ -37,6 +37,11 @@ def keep_places(folder: RunFolder) -> None:
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
 
 
+def test_an_option_without_effect_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="--points does nothing for mesh: it is for colmap"):
+        export(make_run(), "mesh", tmp_path / "mesh.ply", points=5)
+
+
 @pytest.mark.parametrize("up", ["y-down", "z"])
 def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up: str) -> None:
     folder = make_run()
@@ -68,6 +73,7 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
         ("occupancy", "out.png", "z", r"written as \.yaml or \.pgm"),
         ("nerfstudio", "file", "z", "is a file: a scene is several files"),
         ("mesh", "folder.ply", "y-down", "is a folder"),
+        ("video", "out.mp4", "y-down", "one of mesh, cloud, colmap, nerfstudio, occupancy"),
         ("cloud", "file/out.ply", "y-down", "cannot be written"),
     ],
 )

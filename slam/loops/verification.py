@@ -100,7 +100,7 @@ class Loop:
     """A verified loop; ``inliers`` is the smaller of both directions.
 
     ``measured`` is in the unit of the earlier view, ``scale`` that of the later one in it. ``corners`` ``(M, 2)`` are
-    rows of corners of the earlier and of the later view that show one point.
+    rows of corners of the earlier and of the later view that show one point, ``pixels`` ``(M, 2, 2)`` where they are.
     """
 
     measured: RelativePose
@@ -108,6 +108,7 @@ class Loop:
     score: float
     scale: float = 1.0
     corners: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
+    pixels: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 2), np.float32))
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -195,7 +196,9 @@ class LoopVerifier:
         sigmas = self._sigmas(T_middle, depth, difference, forward.sigmas, backward.sigmas * np.repeat([1.0, scale], 3))
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         shared = np.union1d(forward.inliers, backward.inliers)
-        return Loop(measured, inliers, score, scale, np.column_stack([rows_earlier[shared], rows_later[shared]]))
+        corners = np.column_stack([rows_earlier[shared], rows_later[shared]])
+        pixels = np.stack([earlier.pixels[corners[:, 0]], later.pixels[corners[:, 1]]], axis=1)
+        return Loop(measured, inliers, score, scale, corners, pixels)
 
     def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
         """The camera that sees points ``(M, 3)``, NaN where unknown, at pixels ``(M, 2)``; or why not."""

@@ -14,7 +14,6 @@ from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image
-from slam.loops.verification import OF_KEYFRAMES, LoopThresholds
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
@@ -161,5 +160,4 @@ class FolderRecorder(Recorder):
             except SlamError:
                 return next((each.image for each in estimate.drive.keyframes if each.index == index), None)
 
-        thresholds = OF_KEYFRAMES if estimate.drive.maps else LoopThresholds.of_frames(self._settings.loops)
-        return loop_pictures(estimate.loops.accepted, image, sequence.intrinsics, thresholds)
+        return loop_pictures(estimate.loops.accepted, image, sequence.intrinsics)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from erfsfm.common.table import DASH, Table
-from slam.evaluation.trajectory import ALIGNMENTS, TrajectoryMetrics
+from slam.evaluation.trajectory import ALIGNMENTS, AlignedMetrics, TrajectoryMetrics
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
 
@@ -15,14 +15,6 @@ if TYPE_CHECKING:
 
 UNITS = "ATE: RMSE, m; of snippets of five frames, each with its own scale, norm / 5. RE: rad. t_rel, r_rel: 7 dof."
 _LEAK = "LEAK: the weights were trained on the sequence; the numbers are no test."
-_OF_ALIGNMENT = {
-    "ATE\nm": ("ate_rmse_m", 3),
-    "t_rel\n%": ("t_rel_percent", 2),
-    "r_rel\ndeg/100m": ("r_rel_deg_per_100m", 3),
-    "RPE\nm": ("rpe_trans_m", 4),
-    "RPE\ndeg": ("rpe_rot_deg", 4),
-    "scale": ("scale", 4),
-}
 
 
 class ErrorColumn(NamedTuple):
@@ -64,9 +56,12 @@ def errors_table(trajectories: Mapping[str, TrajectoryMetrics], title: str = "")
 
 def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
     """Every statistic of one trajectory under every alignment, and its snippets below."""
-    values = {how: [errors.at(f"align.{how}.{key}") for key, _ in _OF_ALIGNMENT.values()] for how in ALIGNMENTS}
-    decimals = [decimals for _, decimals in _OF_ALIGNMENT.values()]
-    rows = [[how, *(written(value, k) for (value, _), k in zip(row, decimals))] for how, row in values.items()]
+    statistics = AlignedMetrics.statistics()
+    values = {how: [errors.at(f"align.{how}.{key}") for key in statistics] for how in ALIGNMENTS}
+    rows = [
+        [how, *(written(value, each.decimals) for (value, _), each in zip(row, statistics.values()))]
+        for how, row in values.items()
+    ]
     missing = {reason: None for row in values.values() for value, reason in row if value is None}
     snippets, evo = errors.snippet5, errors.evo
     notes = [
@@ -76,7 +71,7 @@ def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
         f"{written(evo.rpe_rot_deg, 4)} deg; largest difference to ours {written(evo.difference, 1)}.",
         *(f"{DASH} {reason}." for reason in missing),
     ]
-    return Table(["alignment", *_OF_ALIGNMENT], rows, title, notes)
+    return Table(["alignment", *(each.header for each in statistics.values())], rows, title, notes)
 
 
 def runs_table(runs: Sequence[RunFolder]) -> Table:

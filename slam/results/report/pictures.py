@@ -45,9 +45,7 @@ class DepthPictures:
         return found
 
 
-def loop_pictures(
-    loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics
-) -> list[Picture]:
+def loop_pictures(loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics) -> list[Picture]:
     """Some loops, spread over the drive: both images with lines between the corners that measured the loop.
 
     Args:

@@ -271,11 +271,11 @@ def localize(
     """
     from slam.commands.localisation import image_numbers, localisation_table, localise, write_localisations
     from slam.results.folder import RunFolder
-    from slam.results.output_file import check_replaced_trajectory
+    from slam.results.output import check_replaced
 
     run_folder = RunFolder.open(map)
     if output is not None:
-        check_replaced_trajectory(output)
+        check_replaced(output)
     numbers = image_numbers(images, frames, every)
     found = []
     with progress_bar() as progress:

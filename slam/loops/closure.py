@@ -48,48 +48,20 @@ class LoopClosures:
         kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
         return replace(self, accepted=kept, rejected=gone + self.rejected)
 
-    def summary(self) -> dict[str, Any]:
-        """For ``metrics.json``: the numbers, and the reasons of the rejected loops with most inliers."""
-        if self.not_sought is not None:
-            names = ("candidates", "verified", "accepted")
-            absent = dict.fromkeys(names) | {f"{name}_reason": self.not_sought for name in names}
-            return {**absent, "rejected": []}
-        return {
-            "candidates": self.candidates,
-            "verified": self.verified,
-            "accepted": len(self.accepted),
-            "rejected": [
-                {"from": loop.from_index, "to": loop.to_index, "reason": loop.reason}
-                for loop in self.rejected[:MOST_REJECTED]
-            ],
-        }
-
     def details(self) -> dict[str, Any]:
-        """For ``loops.json``: every accepted loop and the rejected ones with most inliers, with their measurements."""
-        return {
-            "accepted": [
-                {
-                    **_entry(*loop.ends, loop.inliers, loop.score),
-                    "reason": f"{loop.inliers} inliers in both directions",
-                    "T_from_to": loop.measured.T_from_to.tolist(),
-                    "sigmas": loop.measured.sigmas.tolist(),
-                }
-                for loop in self.accepted
-            ],
-            "rejected": [
-                {
-                    **_entry(loop.from_index, loop.to_index, loop.inliers, loop.score),
-                    "reason": loop.reason,
-                    "T_from_to": None if loop.T_from_to is None else loop.T_from_to.tolist(),
-                }
-                for loop in self.rejected[:MOST_REJECTED]
-            ],
-            "rejected_left_out": max(len(self.rejected) - MOST_REJECTED, 0),
-        }
+        """For ``loops.json``: every accepted loop with its measurement, and the rejected ones with most inliers."""
 
+        def entry(ends: tuple[int, int], loop: Loop | RejectedLoop, **more: Any) -> dict[str, Any]:
+            return {"from": ends[0], "to": ends[1], "inliers": loop.inliers, "score": round(loop.score, 4), **more}
 
-def _entry(from_index: int, to_index: int, inliers: int, score: float) -> dict[str, Any]:
-    return {"from": from_index, "to": to_index, "inliers": inliers, "score": round(score, 4)}
+        accepted = []
+        for loop in self.accepted:
+            reason, measured = f"{loop.inliers} inliers in both directions", loop.measured
+            measurement = {"T_from_to": measured.T_from_to.tolist(), "sigmas": measured.sigmas.tolist()}
+            accepted.append(entry(loop.ends, loop, reason=reason, **measurement))
+        rejected = [entry((loop.from_index, loop.to_index), loop, reason=loop.reason) for loop in self.rejected]
+        more = max(len(rejected) - MOST_REJECTED, 0)
+        return {"accepted": accepted, "rejected": rejected[:MOST_REJECTED], "rejected_left_out": more}
 
 
 def close_loops(

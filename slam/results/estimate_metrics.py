@@ -15,16 +15,16 @@ from erfsfm.evaluation.pose_metrics import (
 )
 from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
-from slam.formats.trajectory import Trajectory, associate
+from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence, runs
 from slam.frontend import gps
 from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import FloatArray, umeyama
+from slam.loops.closure import MOST_REJECTED, LoopClosures
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
-from slam.results.folder import RunFolder
 from slam.results.metrics import (
     AgreementMetrics,
     ConfidenceMetrics,
@@ -34,6 +34,7 @@ from slam.results.metrics import (
     GpsMetrics,
     GraphMetrics,
     LearnedDepthError,
+    LoopEnds,
     LoopMetrics,
     Metrics,
     Origin,
@@ -46,7 +47,6 @@ from slam.results.metrics import (
     Trajectories,
 )
 from slam.runtime.attempt import Failed
-from slam.runtime.run_files import TRAJECTORIES
 from slam.runtime.timing import Stopwatch, peak_rss_mb
 
 _NO_TRUTH = Failed("the sequence has no true poses")
@@ -77,27 +77,12 @@ def estimate_metrics(
         ),
         gps=_gps(result, gps_in_graph),
         graph=_graph(result),
-        loops=LoopMetrics.model_validate(result.loops.summary()),
+        loops=_loops(result.loops),
         tracking=_tracking(result),
         depth_error=_depth_error(result),
         depth=_NO_MAP_YET,
         map=_NO_MAP_YET,
     )
-
-
-def metrics_of_trajectories(folder: RunFolder) -> Trajectories:
-    """Errors of the trajectories in the folder of a killed run; a reason for each missing one."""
-    reference = folder.trajectory("reference")
-    found: dict[str, TrajectoryMetrics | Failed] = {}
-    for name in TRAJECTORIES:
-        estimate = folder.trajectory(name)
-        if estimate is None:
-            found[name] = Failed("the run did not write this trajectory")
-        elif reference is None:
-            found[name] = trajectory_metrics(estimate, None)
-        else:
-            found[name] = trajectory_metrics(*associate(estimate, reference))
-    return Trajectories.of(**found)
 
 
 def lidar_trajectory(result: Estimate) -> Trajectory | None:
@@ -183,6 +168,16 @@ def _graph(result: Estimate) -> GraphMetrics:
     by_source = {source: CoverageMetrics.of(**shares) for source, shares in covered.items()}
     overall = by_source.pop("")
     return GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
+
+
+def _loops(found: LoopClosures) -> LoopMetrics:
+    """Loops by how far they came, and the reasons of the rejected ones with most inliers."""
+    counts = {"candidates": found.candidates, "verified": found.verified, "accepted": len(found.accepted)}
+    if found.not_sought is not None:
+        return LoopMetrics.of(**dict.fromkeys(counts, Failed(found.not_sought)), rejected=[])
+    rejected = found.rejected[:MOST_REJECTED]
+    ends = [LoopEnds(from_=each.from_index, to=each.to_index, reason=each.reason) for each in rejected]
+    return LoopMetrics(**counts, rejected=ends)
 
 
 def _tracking(result: Estimate) -> TrackingMetrics | Failed:

@@ -148,14 +148,4 @@ def _names(runs: Sequence[RunFolder]) -> list[str]:
 def _contents(runs: Sequence[RunFolder]) -> list[Metrics]:
     if not runs:
         raise RunError("no run was given: name one or more run folders")
-    return [_metrics(run) for run in runs]
-
-
-def _metrics(run: RunFolder) -> Metrics:
-    """The metrics of a run; where it was killed before it wrote them, those of its trajectories."""
-    metrics = run.metrics()
-    if metrics.trajectories.absent and run.trajectory("optimised") is not None:
-        from slam.results.estimate_metrics import metrics_of_trajectories
-
-        return metrics.changed(trajectories=metrics_of_trajectories(run))
-    return metrics
+    return [run.metrics() for run in runs]

@@ -18,7 +18,7 @@ from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.loops.closure import LoopClosures, find_loops
 from slam.loops.consistency import Track
-from slam.loops.verification import Loop, RejectedLoop
+from slam.loops.verification import Loop
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
@@ -178,16 +178,6 @@ def test_another_scene_is_no_loop() -> None:
     assert after.loops.accepted == ()
     assert after.joins == ()
     assert len(set(after.poses.segments.values())) == 2
-
-
-def test_a_rejected_loop_from_a_map_without_poses_has_a_length() -> None:
-    loop = RejectedLoop(0, 5, "few corners", 0.5, 9, from_rotation_vector(np.zeros(3), np.ones(3)))
-    scale = Scale("none", MeasurementFailure("no road"), np.full(6, 3.0), {}, "the networks' own unit")
-    (rejected,) = (
-        MapClosure(KeyframePoses(), LoopClosures(rejected=(loop,)), learned_units={0: 2.0}).closures(scale).rejected
-    )
-    assert rejected.T_from_to is not None
-    np.testing.assert_array_equal(rejected.T_from_to[:3, 3], 6.0)
 
 
 @pytest.mark.data

@@ -28,30 +28,18 @@ class Mesh:
     """A finished mesh in the street frame (x east, y north, z up, metres).
 
     Triangles and instances are the last axis of the lookup tables, for which gathering is several times faster.
-
-    Attributes:
-        vertices: ``(V, 3)``.
-        triangles: vertex indices, ``(T, 3)``.
-        uv: texture coordinates of the three corners, metres, ``(3, 2, T)``.
-        normals: unit normals, ``(3, T)``.
-        tangents: unit direction in which u grows, ``(3, T)``.
-        instance: index into the tables below, ``(T,)``.
-        material: of each triangle, ``(T,)``.
-        colours: two base colours per instance, RGB in [0, 1], ``(2, 3, I)``.
-        parameters: of the material's texture, ``(PARAMETERS, I)``.
-        offsets: of an instance in the noise texture, ``(2, I)``.
     """
 
-    vertices: Float32Array
-    triangles: NDArray[np.uint32]
-    uv: Float32Array
-    normals: Float32Array
-    tangents: Float32Array
-    instance: NDArray[np.int32]
-    material: NDArray[np.int8]
-    colours: Float32Array
-    parameters: Float32Array
-    offsets: Float32Array
+    vertices: Float32Array  # (V, 3)
+    triangles: NDArray[np.uint32]  # vertex indices, (T, 3)
+    uv: Float32Array  # texture coordinates of the three corners, metres, (3, 2, T)
+    normals: Float32Array  # unit normals, (3, T)
+    tangents: Float32Array  # unit direction in which u grows, (3, T)
+    instance: NDArray[np.int32]  # index into the tables below, (T,)
+    material: NDArray[np.int8]  # of each triangle, (T,)
+    colours: Float32Array  # two base colours per instance, RGB in [0, 1], (2, 3, I)
+    parameters: Float32Array  # of the material's texture, (PARAMETERS, I)
+    offsets: Float32Array  # of an instance in the noise texture, (2, I)
 
 
 @functools.lru_cache(maxsize=256)
@@ -157,20 +145,13 @@ class Bend:
     """A smooth map from the plan (straight streets, flat ground) to the street frame.
 
     Streets of a town are swayed by two slow sine waves; a lone road follows a heading that wanders.
-
-    Attributes:
-        amplitudes: of the sway in x and in y and of the hills, metres, ``(3,)``.
-        wavelengths: of the same, metres, ``(3,)``.
-        phases: of the same, radians, ``(3, 2)``.
-        road: x, y and heading of a lone road every metre from plan x = ``road_start``, ``(M, 3)``; or None.
-        road_start: plan x of its first row.
     """
 
-    amplitudes: FloatArray
-    wavelengths: FloatArray
-    phases: FloatArray
-    road: FloatArray | None = None
-    road_start: float = 0.0
+    amplitudes: FloatArray  # of the sway in x and in y and of the hills, metres, (3,)
+    wavelengths: FloatArray  # of the same, metres, (3,)
+    phases: FloatArray  # of the same, radians, (3, 2)
+    road: FloatArray | None = None  # x, y and heading of a lone road every metre from road_start on, (M, 3)
+    road_start: float = 0.0  # plan x of its first row
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Map plan points ``(..., 3)`` to the street frame."""

@@ -11,31 +11,18 @@ from slam.simulation.texture import Texels, fractal
 
 @dataclass(frozen=True)
 class Weather:
-    """How a world is lit.
+    """How a world is lit."""
 
-    Attributes:
-        sun: unit direction towards the sun, street frame, ``(3,)``.
-        sunshine: strength of the direct light, 0 overcast.
-        ambient: strength of the light from everywhere.
-        zenith: colour of the sky overhead, ``(3,)``.
-        horizon: colour of the sky low down, and of the haze, ``(3,)``.
-        clouds: cover, 0 to 1.
-        visibility_m: distance at which the haze has taken 63 %.
-        exposure: gain of the camera; None sets it so that a share of the pixels saturates.
-        saturated: that share.
-        contrast: of textures, an exponent; 1 as they are painted.
-    """
-
-    sun: Float32Array
-    sunshine: float
-    ambient: float
-    zenith: Float32Array
-    horizon: Float32Array
-    clouds: float
-    visibility_m: float
-    exposure: float | None
-    saturated: float = 0.0
-    contrast: float = 1.0
+    sun: Float32Array  # unit direction towards the sun, street frame, (3,)
+    sunshine: float  # strength of the direct light, 0 overcast
+    ambient: float  # strength of the light from everywhere
+    zenith: Float32Array  # colour of the sky overhead, (3,)
+    horizon: Float32Array  # colour of the sky low down, and of the haze, (3,)
+    clouds: float  # cover, 0 to 1
+    visibility_m: float  # distance at which the haze has taken 63 %
+    exposure: float | None  # gain of the camera; None sets it so that a share of the pixels saturates
+    saturated: float = 0.0  # that share
+    contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
 
 
 def draw_weather(seed: int) -> Weather:

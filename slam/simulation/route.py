@@ -33,30 +33,18 @@ FEWEST_LOOP_FRAMES = 250
 
 @dataclass(frozen=True)
 class Route:
-    """The camera's trajectory through a street plan.
+    """The camera's trajectory through a street plan."""
 
-    Attributes:
-        plan: the streets.
-        bend: from plan to street coordinates.
-        T_street_camera: ``(N, 4, 4)``; street: x east, y north, z up, metres.
-        camera_height_m: of the camera at rest above the road.
-        lane_street: the driven path on the road, at least ``STEP`` metres of plan each, ``(M, 3)``.
-        lane_offset_m: from the middle of the street to the right.
-        sample: where in ``lane_street`` each frame is, ``(N,)``.
-    """
-
-    plan: StreetPlan
-    bend: Bend
-    T_street_camera: FloatArray
-    camera_height_m: float
-    lane_street: FloatArray
-    lane_offset_m: float
-    sample: FloatArray
+    plan: StreetPlan  # the streets
+    bend: Bend  # from plan to street coordinates
+    T_street_camera: FloatArray  # (N, 4, 4); street: x east, y north, z up, metres
+    camera_height_m: float  # of the camera at rest above the road
+    lane_street: FloatArray  # the driven path on the road, at least STEP metres of plan each, (M, 3)
+    lane_offset_m: float  # from the middle of the street to the right
+    sample: FloatArray  # where in lane_street each frame is, (N,)
 
 
-def plan_route(
-    route: RouteKind, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None
-) -> Route:
+def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None) -> Route:
     """Lay out streets and a drive of ``frames`` frames over them.
 
     Args:
@@ -93,7 +81,7 @@ def plan_route(
 
 
 def _layout(
-    route: RouteKind, moving: int, seed: int, stops: bool, variety: Variety | None
+    route: str, moving: int, seed: int, stops: bool, variety: Variety | None
 ) -> tuple[StreetPlan, Bend, FloatArray]:
     """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
     rng = np.random.default_rng([seed, 0])

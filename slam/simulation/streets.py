@@ -24,25 +24,15 @@ _ROADS: dict[StreetKind, tuple[float, float, float, tuple[float, float]]] = {  #
 
 @dataclass(frozen=True)
 class StreetPlan:
-    """Streets in plan coordinates (metres, x east, y north, z = 0 the road).
+    """Streets in plan coordinates (metres, x east, y north, z = 0 the road)."""
 
-    Attributes:
-        xs: x of the grid lines, the first and last of which are the edge of town, ``(X,)``.
-        ys: y of the grid lines, likewise, ``(Y,)``.
-        along_x: whether the edge from node (i, j) to (i + 1, j) is a street, ``(X - 1, Y)``.
-        along_y: whether the edge from node (i, j) to (i, j + 1) is a street, ``(X, Y - 1)``.
-        half_width: of every street, metres.
-        drive: nodes in the order in which the camera passes them.
-        kind: of streets and what stands beside them.
-    """
-
-    xs: FloatArray
-    ys: FloatArray
-    along_x: BoolArray
-    along_y: BoolArray
-    half_width: float
-    drive: tuple[Node, ...]
-    kind: StreetKind = "town"
+    xs: FloatArray  # x of the grid lines, the first and last of which are the edge of town, (X,)
+    ys: FloatArray  # y of the grid lines, likewise, (Y,)
+    along_x: BoolArray  # whether the edge from node (i, j) to (i + 1, j) is a street, (X - 1, Y)
+    along_y: BoolArray  # whether the edge from node (i, j) to (i, j + 1) is a street, (X, Y - 1)
+    half_width: float  # of every street, metres
+    drive: tuple[Node, ...]  # nodes in the order in which the camera passes them
+    kind: StreetKind = "town"  # of streets and what stands beside them
 
     def node(self, node: Node) -> FloatArray:
         """Plan position of a node, ``(2,)``."""

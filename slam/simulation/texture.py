@@ -17,23 +17,14 @@ _SIZE = 256  # lattice cells before the noise repeats
 
 @dataclass(frozen=True)
 class Texels:
-    """Texture coordinates of the pixels of one material; every field is ``(N,)``, metres.
+    """Texture coordinates of the pixels of one material; every field is ``(N,)``, metres."""
 
-    Attributes:
-        u: along the surface.
-        v: across or up the surface.
-        u_size: footprint of the pixel along u.
-        v_size: footprint of the pixel along v.
-        shift: offset of the instance in the noise along u.
-        shift_v: the same along v.
-    """
-
-    u: Float32Array
-    v: Float32Array
-    u_size: Float32Array
-    v_size: Float32Array
-    shift: Float32Array
-    shift_v: Float32Array
+    u: Float32Array  # along the surface
+    v: Float32Array  # across or up the surface
+    u_size: Float32Array  # footprint of the pixel along u
+    v_size: Float32Array  # footprint of the pixel along v
+    shift: Float32Array  # offset of the instance in the noise along u
+    shift_v: Float32Array  # the same along v
 
 
 @functools.cache

@@ -7,7 +7,7 @@ few enough frames for it, and words trained on its own images discriminate bette
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ _WORDS = 1000  # size of the binary vocabulary learned on the run
 Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 
 
-@dataclass(frozen=True)
-class Candidate:
+class Candidate(NamedTuple):
     """Two similar views by their rows; ``score`` is their similarity over that of neighbouring frames."""
 
     earlier: int

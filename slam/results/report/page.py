@@ -12,12 +12,10 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
-from erfsfm.common.table import Table
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.metrics import METRES, LoopsFile, Metrics
+from slam.results.metrics import METRES, AcceptedLoop, LoopsFile, Metrics
 from slam.results.report import tables
 from slam.results.report.map_view import MapView
 from slam.results.report.verdict import verdict
@@ -80,45 +78,33 @@ def write_report(
     """
     metrics = metrics or folder.metrics()
     said, errors = verdict(metrics), metrics.evaluated_errors()
-    no_errors, has_map = missing_errors(errors), metrics.map.triangles is not None
-    optimised = metrics.trajectories.optimised
+    no_errors, optimised = missing_errors(errors), metrics.trajectories.optimised
+    no_map = metrics.map.absent or ("" if metrics.map.triangles is not None else metrics.map.why("triangles"))
     page = _TEMPLATES.get_template("page.html.j2").render(
         script=(files("slam.results.report") / "page.js").read_text("utf-8"),
         plotly=_plotly,
-        name=metrics.sequence.name or folder.path.resolve().name,
-        failure=metrics.failure,
+        tables=tables,
+        folder=folder,
+        metrics=metrics,
         verdict=said,
-        leak=metrics.provenance.leak is True,
-        version=metrics.provenance.version or "",
-        unit_notes=metrics.unit_notes(),
-        key_numbers=[] if said is None else tables.key_numbers(metrics, has_map=not said.scraps),
-        what_ran=_html(tables.what_ran(metrics)),
-        plots=_plots(metrics, _trajectories(folder), _loops_file(folder), view),
-        errors=_html(errors_table(errors) if errors and not no_errors else None),
-        alignments=_html(alignments_table(optimised) if not optimised.absent and not no_errors else None),
+        plots=_plots(metrics, _trajectories(folder), _accepted(folder), view),
+        errors=errors_table(errors) if errors and not no_errors else None,
+        alignments=alignments_table(optimised) if not optimised.absent and not no_errors else None,
         no_errors=no_errors,
         depths=depths,
-        map_errors=_html(tables.map_errors(metrics)),
-        no_map=_absence(metrics, metrics.map.absent or ("" if has_map else metrics.map.why("triangles"))),
-        loops=tables.loop_counts(metrics),
+        no_map=_absence(metrics, no_map),
         loop_pictures=loops,
         no_loops=_absence(metrics, metrics.loops.absent),
-        timing=_html(tables.timing(metrics)),
-        files=_html(tables.files(folder)),
     )
     folder.write_text(REPORT, page)
 
 
-def _html(table: Table | None) -> Markup:
-    return Markup("" if table is None else table.html())
-
-
-def _loops_file(folder: RunFolder) -> LoopsFile:
-    """``loops.json``; empty where the file is missing or damaged."""
+def _accepted(folder: RunFolder) -> list[AcceptedLoop]:
+    """The accepted loops; none where ``loops.json`` is missing or damaged."""
     try:
-        return LoopsFile.read(folder.path / LOOPS)
+        return LoopsFile.read(folder.path / LOOPS).accepted or []
     except (OSError, RunError):
-        return LoopsFile()
+        return []
 
 
 def _absence(metrics: Metrics, reason: str) -> str:
@@ -137,7 +123,7 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
 
 
 def _plots(
-    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: LoopsFile, view: MapView | None
+    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: Sequence[AcceptedLoop], view: MapView | None
 ) -> dict[str, list[Picture]]:
     """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
     from slam.results.report import figures
@@ -154,9 +140,9 @@ def _plots(
 
     has_truth = REFERENCE in trajectories and len(trajectories) > 1
     unit = "m" if metrics.unit == METRES else metrics.unit
-    gaps, accepted = metrics.sequence.bridged or [], loops.accepted or []
+    gaps = metrics.sequence.bridged or []
     if trajectories:
-        given = (trajectories, "m" if has_truth else unit, accepted)
+        given = (trajectories, "m" if has_truth else unit, loops)
         caption = _ALIGNED if has_truth else _AS_WRITTEN
         add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
     if has_truth:

@@ -38,7 +38,7 @@ def number(value: Any, decimals: int = 0) -> str:
 
 
 def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
-    """The key numbers that there are: name, value and unit of each; of the map where it is one."""
+    """The key numbers that there are: name, value and unit of each; of the map where it is more than scraps."""
     best = metrics.trajectories.optimised.align
     error = (best.dof6, "m, 6 dof") if metrics.is_metric else (best.dof7, "m, 7 dof")
     wanted = [

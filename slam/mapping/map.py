@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -24,21 +26,6 @@ _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the r
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
 _EARLIER = 3  # views between one and that which tells what has come since
 _KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
-
-
-@dataclass(frozen=True)
-class MapStatistics:
-    """Sizes of a map and its voxels, the share of pixels that each filter took, and of triangles in loose pieces."""
-
-    triangles: int
-    points: int
-    blocks: int
-    submaps: int
-    frames_fused: int
-    frames_left_out: int
-    voxel_size: float
-    filters: dict[str, float]
-    floater_share: float
 
 
 class TsdfMap:
@@ -127,16 +114,15 @@ class TsdfMap:
         """Side of a voxel, in the trajectory's unit."""
         return self._config.voxel_size_m
 
-    def statistics(self) -> MapStatistics:
-        """Counts of all that was given so far, zero for an empty map."""
+    def statistics(self) -> dict[str, Any]:
+        """Sizes of all that was given so far, zero for an empty map, and the share of pixels that each filter took."""
         self._fuse_waiting(None)
-        frames, filters = (self._fused, self._left_out), self._filters.shares()
-        try:
+        sizes = {"triangles": 0, "points": 0, "blocks": 0, "submaps": len(self._finished), "floater_share": 0.0}
+        with suppress(EmptyMapError):
             surface = self.surface()
-        except EmptyMapError:
-            return MapStatistics(0, 0, 0, len(self._finished), *frames, self.voxel_size, filters, 0.0)
-        sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
-        return MapStatistics(*sizes, *frames, self.voxel_size, filters, surface.floater_share)
+            sizes = {name: getattr(surface, name) for name in sizes}
+        frames = {"frames_fused": self._fused, "frames_left_out": self._left_out}
+        return sizes | frames | {"voxel_size": self.voxel_size, "filters": self._filters.shares()}
 
     def _fuse_waiting(self, following: KeyframeDepth | None) -> None:
         """Fuse the view that waits for the one after it."""

@@ -33,7 +33,6 @@ from slam.results.metrics import (
     GpsErrors,
     GpsMetrics,
     GraphMetrics,
-    LearnedDepthError,
     LoopEnds,
     LoopMetrics,
     Metrics,
@@ -193,12 +192,12 @@ def _tracking(result: Estimate) -> TrackingMetrics | Failed:
     )
 
 
-def _depth_error(result: Estimate) -> list[LearnedDepthError] | Failed:
+def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
     curve, unit = result.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
         return Failed("no step triangulated corners with learned depth")
-    return [LearnedDepthError(depth=unit * at, bias=b, sigma=s, corners=count) for at, b, s, count in curve]
+    return [{"depth": unit * at, "bias": b, "sigma": s, "corners": count} for at, b, s, count in curve]
 
 
 def _gps(result: Estimate, in_graph: bool) -> GpsMetrics | Failed:

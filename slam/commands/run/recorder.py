@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from contextlib import suppress
-from dataclasses import asdict
 
 from erfsfm.common.errors import explained
 from erfsfm.common.progress import Progress, silent
@@ -112,7 +111,7 @@ class FolderRecorder(Recorder):
             pieces = lambda: (Ply(piece).points for piece in surface.cloud_pieces())  # noqa: E731
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
-        sizes = asdict(estimate.map.statistics())
+        sizes = estimate.map.statistics()
         found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
         self._metrics = self._metrics.changed(map=found)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -40,6 +41,9 @@ class Mesh:
     colours: Float32Array  # two base colours per instance, RGB in [0, 1], (2, 3, I)
     parameters: Float32Array  # of the material's texture, (PARAMETERS, I)
     offsets: Float32Array  # of an instance in the noise texture, (2, I)
+
+
+_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
 
 @functools.lru_cache(maxsize=256)
@@ -196,8 +200,12 @@ def road_bend(rng: np.random.Generator, start: float, end: float, hills: tuple[f
 class Moving:
     """Meshes around their own origins, to be placed anew at every frame."""
 
-    def __init__(self, soup: Soup, first_instances: list[int]) -> None:
-        """Things in a soup, each of which begins with one of these instances."""
+    def __init__(self, rng: np.random.Generator, makers: Sequence[Callable[[Soup], None]]) -> None:
+        """Things that are made one after another in one soup."""
+        soup, first_instances = Soup(rng), []
+        for make in makers:
+            first_instances.append(soup.instances)
+            make(soup)
         self._mesh = soup.finish(FLAT)
         self._thing_of_triangle = np.searchsorted(first_instances, self._mesh.instance, side="right") - 1
 
@@ -207,28 +215,15 @@ class Moving:
             return []
         parts = [self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()]
         corners = np.concatenate([part.vertices for part in parts])
-        placed = dataclasses.replace(
-            self._mesh,
-            vertices=corners,
-            triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
-            uv=np.concatenate([part.uv for part in parts], axis=-1),
-            normals=np.concatenate([part.normals for part in parts], axis=-1),
-            tangents=np.concatenate([part.tangents for part in parts], axis=-1),
-            instance=np.concatenate([part.instance for part in parts]),
-            material=np.concatenate([part.material for part in parts]),
-        )
-        return [placed]
+        corners_of = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+        tables = {name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in _OF_TRIANGLES}
+        return [dataclasses.replace(self._mesh, vertices=corners, triangles=corners_of, **tables)]
 
     def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:
         """The triangles of one thing, three vertices each, moved into the scene."""
         mine = self._thing_of_triangle == number
         R, t = T_scene_thing[:3, :3].astype(np.float32), T_scene_thing[:3, 3].astype(np.float32)
-        return dataclasses.replace(
-            self._mesh,
-            vertices=self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t,
-            uv=self._mesh.uv[..., mine],
-            normals=R @ self._mesh.normals[:, mine],
-            tangents=R @ self._mesh.tangents[:, mine],
-            instance=self._mesh.instance[mine],
-            material=self._mesh.material[mine],
-        )
+        tables = {name: getattr(self._mesh, name)[..., mine] for name in _OF_TRIANGLES}
+        tables |= {name: R @ tables[name] for name in ("normals", "tangents")}
+        vertices = self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t
+        return dataclasses.replace(self._mesh, vertices=vertices, **tables)

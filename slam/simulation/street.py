@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.runtime.imports import import_open3d
 from slam.simulation import hazards as effects
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving, Soup
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
 from slam.simulation.hazards import Traffic
 from slam.simulation.light import draw_varied_weather, draw_weather, paint, sky
 from slam.simulation.objects import bonnet
@@ -84,10 +84,8 @@ class SimulatedStreet(SimulatedWorld):
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
         rng = np.random.default_rng([self.options.seed, 12])
-        soup = Soup(rng)
         below = (self.options.height * (1.0 - self._variety.bonnet) - self.K[1, 2]) / self.K[1, 1]
-        bonnet(soup, rng, float(below), self.camera_height_m)
-        return Moving(soup, [0])
+        return Moving(rng, [lambda soup: bonnet(soup, rng, float(below), self.camera_height_m)])
 
     @functools.cached_property
     def _gain(self) -> float:

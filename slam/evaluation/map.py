@@ -20,18 +20,19 @@ from slam.evaluation.surface import (
     RANGE_M,
     SAMPLE_VOXEL_M,
     SPARSE_VIEW_STEP_M,
+    VIEW_STEP_DEG,
     VIEW_STEP_M,
     Indices,
     SurfaceTruth,
     accumulated,
     length_m,
-    moved_frames,
     nearby,
     stretches,
     thinned,
 )
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
+from slam.mapping.views import moved_rows
 from slam.runtime.attempt import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part
@@ -142,7 +143,8 @@ def compare(
         maps: points ``(P, 3)`` in the world of the true poses, by name; they share the cost of the truth.
     """
     parts = stretches(T_world_camera, truth.frames)
-    views = moved_frames(T_world_camera, truth.frames, VIEW_STEP_M if truth.distance is None else SPARSE_VIEW_STEP_M)
+    step_m = VIEW_STEP_M if truth.distance is None else SPARSE_VIEW_STEP_M
+    views = truth.frames[moved_rows(T_world_camera[truth.frames], step_m, VIEW_STEP_DEG)]
     cameras = cKDTree(T_world_camera[:, :3, 3])
     nearest = {name: cameras.query(points, distance_upper_bound=RANGE_M) for name, points in maps.items()}
     found: dict[str, list[tuple[NDArray[Any], ...]]] = {name: [] for name in maps}

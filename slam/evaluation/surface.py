@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slam.frames import Mask
-from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
+from slam.geometry.se3 import FloatArray, path_distance
 
 RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
 STRETCH_M = 100.0
@@ -23,11 +23,11 @@ MOST_STRETCHES = 5
 TRUTH_VOXEL_M = 0.05
 SAMPLE_VOXEL_M = 0.2
 VIEW_STEP_M = 1.0
+VIEW_STEP_DEG = 5.0
 SPARSE_VIEW_STEP_M = 3.0  # where views do not measure the accuracy
 
 _BEYOND_M = 5.0  # of the range of map points: a wrong one may be nearest to surface out there
 _WAITING_POINTS = 2_000_000
-_VIEW_STEP_DEG = 5.0
 _NEAR_TRUTH_M = 5.0  # of a camera to the nearest one that measured the surface
 _KEY_BITS = 21  # a coordinate in voxels, both signs
 
@@ -92,20 +92,6 @@ def length_m(T_world_camera: FloatArray, parts: list[Indices]) -> float:
     steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     to_next = np.append(steps, 0.0)
     return float(sum(to_next[part].sum() for part in parts))
-
-
-def moved_frames(T_world_camera: FloatArray, frames: Indices, step_m: float) -> Indices:
-    """The increasing ``frames`` that are ``step_m`` or 5 degrees from the chosen one before."""
-    kept: list[int] = []
-    for frame in frames:
-        if kept:
-            T_last, T_next = T_world_camera[kept[-1]], T_world_camera[frame]
-            moved = float(np.linalg.norm(T_next[:3, 3] - T_last[:3, 3]))
-            turned = float(rotation_angle(T_last[:3, :3].T @ T_next[:3, :3]))
-            if moved < step_m and turned < np.deg2rad(_VIEW_STEP_DEG):
-                continue
-        kept.append(int(frame))
-    return np.array(kept, dtype=np.int64)
 
 
 def nearby(T_world_camera: FloatArray, views: Indices, part: Indices) -> Indices:

@@ -18,7 +18,7 @@ from slam.geometry.se3 import FloatArray
 from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
-from slam.mapping.views import ViewChooser, has_moved
+from slam.mapping.views import ViewChooser, moved_rows
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpillFile
 
@@ -73,13 +73,7 @@ class TsdfMap:
             frames: frame numbers in time order.
             T_world_camera: poses of all frames ``(N, 4, 4)``.
         """
-        chosen: list[int] = []
-        step_m = self._config.keyframe_distance_m
-        for position, frame in enumerate(frames):
-            before = T_world_camera[frames[chosen[-1]]] if chosen else None
-            if before is None or has_moved(T_world_camera[frame], before, step_m, _KEYFRAME_ROTATION_DEG):
-                chosen.append(position)
-        return chosen
+        return moved_rows(T_world_camera[list(frames)], self._config.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)
 
     def surface(self, progress: Progress = silent) -> MapSurface:
         """The surface of all that was fused; more depth maps may follow.

@@ -172,11 +172,6 @@ def _wood(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     return mix(colours[0] * (1.0 + veins) * (1.0 - 0.6 * gaps), colours[1], knobs)
 
 
-def _fabric(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    grain = fractal(texels, (0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12))
-    return np.asarray(colours[0] * (1.0 + grain))
-
-
 def _books(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     """Rows of spines of all colours between boards; the upper part of a row is dark."""
     width, height, row = parameters[:3]
@@ -238,10 +233,6 @@ def _carton(texels: Texels, colours: Float32Array, parameters: Float32Array) -> 
     label = label * band(texels.v, texels.v_size, 0.08 * height, 0.38 * height) * (colours[1][0] > 0.3)
     rgb = mix(rgb, mix(np.float32(0.88), colours[1] * 0.3, _text(texels, 0.035, 0.03)), label)
     return rgb * (1.0 - 0.35 * _rim(texels, width, height, 0.008))
-
-
-def _lamp(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    return np.asarray(colours[0], dtype=np.float32)
 
 
 Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
@@ -317,6 +308,15 @@ def _mottled(*octaves: tuple[float, float, float]) -> Shader:
     return shader
 
 
+def _grained(*octaves: tuple[float, float, float]) -> Shader:
+    """One colour under noise."""
+
+    def shader(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
+        return np.asarray(colours[0] * (1.0 + fractal(texels, *octaves)))
+
+    return shader
+
+
 def _wall(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     _, spacing, window, _, style, height = parameters
     u, v = texels.u - 0.5 * (spacing - window), texels.v
@@ -376,10 +376,6 @@ def _roof(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     return np.asarray(colours[0] * (1.0 + grain - 0.3 * rows - 0.15 * tiles))
 
 
-def _metal(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    return np.asarray(colours[0] * (1.0 + fractal(texels, (0.5, 1.3, 0.25), (0.2, 0.4, 0.2))))
-
-
 def _sign(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     half, kind = parameters[0], parameters[1]
     x, y, size = texels.u - half, texels.v - half, np.maximum(texels.u_size, texels.v_size)
@@ -434,7 +430,7 @@ _SHADERS: dict[Material, Shader] = {
     Material.ROOF: _roof,
     Material.BARK: _mottled((0.12, 0.6, 0.5), (0.4, 1.5, 0.4)),
     Material.LEAVES: _mottled((1.6, 1.6, 0.4), (0.55, 0.55, 0.6), (0.2, 0.2, 0.5)),
-    Material.METAL: _metal,
+    Material.METAL: _grained((0.5, 1.3, 0.25), (0.2, 0.4, 0.2)),
     Material.SIGN: _sign,
     Material.PAINT: _paint,
     Material.GLASS: _glass,
@@ -445,11 +441,11 @@ _SHADERS: dict[Material, Shader] = {
     Material.BOARDS: _boards,
     Material.CARPET: _carpet,
     Material.WOOD: _wood,
-    Material.FABRIC: _fabric,
+    Material.FABRIC: _grained((0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12)),
     Material.BOOKS: _books,
     Material.PICTURE: _picture,
     Material.SCREEN: _screen,
     Material.PANE: _pane,
     Material.CARTON: _carton,
-    Material.LAMP: _lamp,
+    Material.LAMP: _grained(),
 }

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from erfsfm.common.table import DASH, Table
 from slam.evaluation.trajectory import ALIGNMENTS, AlignedMetrics, TrajectoryMetrics
-from slam.results.metrics import Metrics
-from slam.runtime.errors import RunError
 
 if TYPE_CHECKING:
     from slam.results.folder import RunFolder
@@ -78,11 +76,11 @@ def runs_table(runs: Sequence[RunFolder]) -> Table:
     """One row for each run and trajectory; runs that failed or were killed with the reason.
 
     Raises:
-        RunError: no run was given, or its ``metrics.json`` is damaged.
+        RunError: a ``metrics.json`` is damaged.
     """
     rows: list[list[str]] = []
     notes: dict[str, None] = {UNITS: None}
-    for name, metrics in zip(_names(runs), _contents(runs)):
+    for name, metrics in zip(_names(runs), (run.metrics() for run in runs)):
         errors, title = metrics.evaluated_errors(), name
         if metrics.failure:
             ended = "failed" if metrics.status == "failed" else "did not end"
@@ -105,10 +103,11 @@ def runs_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
     """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory.
 
     Raises:
-        RunError: no run was given, or its ``metrics.json`` is damaged.
+        RunError: a ``metrics.json`` is damaged.
     """
     objects = []
-    for run, metrics in zip(runs, _contents(runs)):
+    for run in runs:
+        metrics = run.metrics()
         tree = metrics.tree()
         entry: dict[str, Any] = {"run": str(run.path), "status": metrics.status}
         if metrics.failure:
@@ -143,9 +142,3 @@ def _names(runs: Sequence[RunFolder]) -> list[str]:
     """Short names of runs: the folder's own, or the whole path where it is not unique."""
     names = [run.path.resolve().name for run in runs]
     return [str(run.path) if names.count(name) > 1 else name for run, name in zip(runs, names)]
-
-
-def _contents(runs: Sequence[RunFolder]) -> list[Metrics]:
-    if not runs:
-        raise RunError("no run was given: name one or more run folders")
-    return [run.metrics() for run in runs]

@@ -7,7 +7,6 @@ import functools
 import cv2
 import numpy as np
 
-from slam.config.sections import KeyframesConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
@@ -61,9 +60,9 @@ def frame(index: int, T_world_camera: FloatArray, seed: int = 0, near: bool = Tr
     return Frame(index, index / 30.0, image(T_world_camera, seed, near))
 
 
-def tracked(config: KeyframesConfig, T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometry:
+def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometry:
     """After the frames of a camera; each shows the walls of its seed."""
-    odometry = KeyframeOdometry(config, INTRINSICS)
+    odometry = KeyframeOdometry(INTRINSICS)
     for k, T in enumerate(T_world_camera):
         view = frame(k, T, 0 if seeds is None else seeds[k])
         odometry.follow(view)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,7 +27,6 @@ def load_config(
     file_or_name: str | Path | None,
     overrides: Sequence[str],
     shipped: Sequence[Path],
-    sections: Collection[str] | None = None,
 ) -> M:
     """Read a configuration and change some of its keys.
 
@@ -36,8 +35,6 @@ def load_config(
         file_or_name: a YAML file, or the name of one in a shipped folder; None for the defaults of the model.
         overrides: ``section.key=value`` each, the value in YAML; later ones win.
         shipped: folders of named configurations, the first one that has a name wins.
-        sections: of the file that are read, without keys that are unknown now; the others keep their defaults. None
-            for all sections, and no unknown key.
 
     Raises:
         ConfigError: one line that names the key and the file or override, what came and what is allowed.
@@ -47,9 +44,6 @@ def load_config(
     if file_or_name is not None:
         path = find_config(file_or_name, shipped)
         origin, tree = str(path), _read_tree(path)
-        if sections is not None:
-            known = set(_known_keys(model))
-            tree = {name: _only(tree[name], name, known) for name in sections if name in tree}
     for text in overrides:
         _override(tree, text)
     try:
@@ -114,12 +108,6 @@ def _read_tree(path: Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
     return tree
-
-
-def _only(section: Any, name: str, known: Collection[str]) -> Any:
-    if not isinstance(section, dict):
-        return section
-    return {key: value for key, value in section.items() if f"{name}.{key}" in known}
 
 
 def _override(tree: dict[str, Any], text: str) -> None:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import os
 import re
+import runpy
 import shlex
+import signal
+import sys
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +37,6 @@ from slam.sequences.excerpt import frame_range
 CSV = "drives.csv"
 _MANIFEST = ".csv"
 _KEYS = ("name", "dataset", "sequence", "camera", "options")
-_OURS = ("--dataset", "--sequence", "-s", "--camera", "--output", "--json")
 _LOG_BEGIN = "erfsfm-slam run "  # a log begins with the command
 _FIRST = ("drive", "status", "reason")
 # columns of drives.csv, and their decimals on a terminal, which shows those that have some
@@ -79,9 +83,16 @@ class Outcome:
 
 
 def options_of_drives(
-    weights: str | None, config: str | None, overrides: Iterable[str], frames: str | None, seed: int, device: str
+    weights: str | None, config: str | None, overrides: Sequence[str], frames: str | None, seed: int, device: str
 ) -> list[str]:
-    """Options of ``run`` for all drives, with paths that hold in the folder of each."""
+    """Options of ``run`` for all drives, with paths that hold in the folder of each.
+
+    Raises:
+        SlamError, ErfsfmError: one of them is wrong whatever the recordings hold.
+    """
+    load_config(config, overrides)
+    record_of_whole_weights(weights or "default")
+    frame_range(frames or ":", EVERYTHING)
     words = []
     for override in overrides:
         kind, colon, path = override.partition(":")
@@ -97,7 +108,7 @@ def options_of_drives(
 
 
 def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
-    """The drives of a manifest, or the named sequences of a data set; their options are checked.
+    """The drives of a manifest, or the named sequences of a data set.
 
     Args:
         manifest_or_root: a ``.csv`` file, or a data set.
@@ -105,20 +116,16 @@ def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequenc
         options: of ``run``, for all drives; those of a manifest come after them.
 
     Raises:
-        SlamError, ErfsfmError: no such file or sequences, or an entry or option that is not understood.
+        SlamError: no such file or sequences, or an entry that is not understood.
     """
     is_manifest = manifest_or_root.suffix.lower() == _MANIFEST
     if is_manifest and manifest_or_root.is_file():
         if list(sequences) != ["all"]:
             raise SequenceError(f"{manifest_or_root} names its sequences itself: leave out --sequence")
-        drives = _manifest(manifest_or_root, options)
-    elif is_manifest and not manifest_or_root.exists():
+        return _manifest(manifest_or_root, options)
+    if is_manifest and not manifest_or_root.exists():
         raise SequenceError(f"no manifest {manifest_or_root}: check the path")
-    else:
-        drives = _of_data_set(manifest_or_root, sequences, options)
-    for drive in drives:
-        _require_known(drive)
-    return drives
+    return _of_data_set(manifest_or_root, sequences, options)
 
 
 def run_drives(
@@ -172,7 +179,7 @@ def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 
     output.mkdir(parents=True, exist_ok=True)
     log = output / f"{drive.name}.log"
     log.write_text(shlex.join(["erfsfm-slam", *arguments]) + "\n", encoding="utf-8")
-    program = ("slam.commands.batch_process", str(output / f".{drive.name}.lock"))
+    program = ("slam.commands.batch", str(output / f".{drive.name}.lock"))
     reason = slam_process(arguments, drive.folder, log, threads, memory_gib, program)
     if not reason and not _is_whole(folder, arguments):
         reason = "it ended well and left no whole run: leave out options that only ask something"
@@ -249,11 +256,6 @@ def _drive(row: dict[str, str], path: Path, where: str, options: Sequence[str]) 
         raise SequenceError(
             f"{where}: options are not understood ({error}): write them as on a command line"
         ) from error
-    taken = [word for word in own if word.partition("=")[0] in _OURS]
-    if taken:
-        raise SequenceError(
-            f"{where}: {taken[0]} is no option of a drive: use the keys, the folder is given by the batch"
-        )
     named = [word for key in ("dataset", "sequence", "camera") if key in row for word in (f"--{key}", row[key])]
     name = row.get("name") or row.get("sequence") or Path(row["dataset"]).stem
     return Drive(name, path.absolute().parent, (*named, *options, *own))
@@ -270,27 +272,6 @@ def _named(drives: Iterable[Drive]) -> list[Drive]:
             unique = f"{name}-{number}"
         found[unique] = replace(drive, name=unique)
     return list(found.values())
-
-
-def _require_known(drive: Drive) -> None:
-    """Check what can be wrong in the options of a drive whatever its recording holds.
-
-    Raises:
-        SlamError, ErfsfmError: one line.
-    """
-    given: dict[str, list[str]] = {}
-    for word, following in zip(drive.arguments, (*drive.arguments[1:], "")):
-        option, equals, value = word.partition("=")
-        given.setdefault(option, []).append(value if equals else following)
-
-    def last(option: str, default: str | None = None) -> str | None:
-        value = given.get(option, [default])[-1]
-        return str(drive.folder / value) if value and (drive.folder / value).exists() else value
-
-    load_config(last("--config"), given.get("--set", ()))
-    if (frames := last("--frames")) is not None:
-        frame_range(frames, EVERYTHING)
-    record_of_whole_weights(last("--weights", "default") or "")
 
 
 def _is_whole(folder: Path, arguments: list[str]) -> bool:
@@ -313,3 +294,16 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         return row | dict.fromkeys(_COLUMNS)
     metrics = RunFolder(outcome.folder).metrics()
     return row | {name: value(metrics) for name, (value, _) in _COLUMNS.items()}
+
+
+def _end_with_the_worker() -> None:
+    while os.read(0, 1024):  # not sys.stdin, which Python cannot close under a reader as it exits
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":  # LOCK run ...: a drive, which ends when its standard input does; no two to one folder
+    lock = Path(sys.argv.pop(1)).open("w", encoding="utf-8")  # noqa: SIM115 - held until the process ends
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    threading.Thread(target=_end_with_the_worker, daemon=True).start()
+    runpy.run_module("slam", run_name="__main__", alter_sys=True)

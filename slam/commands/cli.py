@@ -6,9 +6,8 @@ import json
 import logging
 import shlex
 import sys
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -41,6 +40,7 @@ UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 
 @app.command()
 def run(
+    context: typer.Context,
     dataset: Annotated[
         Path | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
     ] = None,
@@ -68,25 +68,7 @@ def run(
     from slam.commands.run.run import perform
 
     with progress_bar() as progress:
-        folder = perform(
-            RunRequest(
-                dataset=dataset,
-                sequence=sequence,
-                camera=camera,
-                weights=weights,
-                config=config,
-                overrides=overrides,
-                frames=frames,
-                truth=truth,
-                output=output,
-                rerun=rerun,
-                gps=gps,
-                seed=seed,
-                device=device,
-                progress=progress,
-                command=_command(),
-            )
-        )
+        folder = perform(RunRequest.of(**_given(context), progress=progress))
     if as_json:
         typer.echo(folder.metrics().to_json())
     else:
@@ -95,6 +77,7 @@ def run(
 
 @app.command()
 def live(
+    context: typer.Context,
     dataset: Annotated[str, typer.Option(help="number of a camera, address of a stream, video, or folder")],
     camera: Camera = None,
     every_frame: Annotated[
@@ -113,23 +96,9 @@ def live(
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.run import LiveRequest, run_live, write_line
+    from slam.commands.live.run import LiveRequest, run_live
 
-    request = LiveRequest(
-        dataset=dataset,
-        camera=camera,
-        every_frame=every_frame,
-        output=output,
-        view=view,
-        wait=wait,
-        weights=weights,
-        config=config,
-        overrides=overrides,
-        seed=seed,
-        device=device,
-        command=_command(),
-    )
-    folder = run_live(request, partial(write_line, sys.stdout))
+    folder = run_live(LiveRequest.of(**_given(context)), lambda message: typer.echo(json.dumps(message)))
     typer.echo(f"everything in {folder.path}", err=True)
 
 
@@ -218,14 +187,18 @@ def evaluate(
 @app.command()
 def export(
     run: Annotated[Path, typer.Argument(help="a run folder")],
-    what: Annotated[str, typer.Option(help="mesh, cloud, colmap, nerfstudio or occupancy")],
+    what: Annotated[
+        Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"], typer.Option(help="the part of the run")
+    ],
     output: Annotated[Path, typer.Option(help="the file to write; for colmap and nerfstudio a folder")],
-    up: Annotated[str, typer.Option(help="axes of the world: y-down (camera axes) or z")] = "y-down",
-    resolution: Annotated[float | None, typer.Option(help="side of a cell of an occupancy grid; default 0.1")] = None,
+    up: Annotated[
+        Literal["y-down", "z"], typer.Option(help="axes of the world: those of the camera, or z up")
+    ] = "y-down",
+    resolution: Annotated[float, typer.Option(min=1e-6, help="side of a cell of an occupancy grid")] = 0.1,
     dataset: Annotated[
         Path | None, typer.Option(help="where the images of the run are now, for colmap and nerfstudio")
     ] = None,
-    points: Annotated[int | None, typer.Option(help="at most so many points of a COLMAP model")] = None,
+    points: Annotated[int | None, typer.Option(min=1, help="at most so many points of a COLMAP model")] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
 ) -> None:
@@ -269,21 +242,17 @@ def localize(
 
     Example: erfsfm-slam localize photos --map results/latest --output photos.tum
     """
-    from slam.commands.localisation import image_numbers, localisation_table, localise, write_localisations
+    from slam.commands.localisation import localisation_table, localise, write_localisations
     from slam.results.folder import RunFolder
     from slam.results.output import check_replaced
 
     run_folder = RunFolder.open(map)
     if output is not None:
         check_replaced(output)
-    numbers = image_numbers(images, frames, every)
-    found = []
     with progress_bar() as progress:
-        for localisation in localise(images, run_folder, camera, numbers):
-            found.append(localisation)
-            progress("images", len(found), len(numbers))
+        found = localise(images, run_folder, camera, frames, every, progress)
     if output is not None:
-        write_localisations(output, found, numbers)
+        write_localisations(output, found)
     if as_json:
         typer.echo(json.dumps([each.tree() for each in found], indent=2))
         return
@@ -464,8 +433,10 @@ def _print_run(folder: RunFolder) -> None:
     )
 
 
-def _command() -> str:
-    return shlex.join(["erfsfm-slam", *sys.argv[1:]])
+def _given(context: typer.Context) -> dict[str, Any]:
+    """The options of a verb by name, and the whole command."""
+    options = {name: value for name, value in context.params.items() if name != "as_json"}
+    return options | {"command": shlex.join(["erfsfm-slam", *sys.argv[1:]])}
 
 
 def main() -> None:

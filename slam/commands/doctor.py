@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import platform
-import re
-from importlib.metadata import distribution, version
+from importlib.metadata import version
 from pathlib import Path
 
 from erfsfm.common.errors import ErfsfmError
@@ -54,9 +53,6 @@ def _package(name: str) -> str:
     try:
         if name in IMPORTED:
             importlib.import_module(IMPORTED[name])
-        for needed in distribution(name).requires or ():
-            if ";" not in needed:  # without a condition
-                distribution(re.split(r"[^\w.-]", needed)[0])
         return f"ok       {name} {version(name)}"
     except (ImportError, OSError) as error:
         return f"missing  {name}: {error}; run make setup, or pip install --force-reinstall {name}"

@@ -6,10 +6,10 @@ import re
 import shutil
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Any
 
 from erfsfm.common.progress import Progress
 from slam.runtime.errors import DownloadError
@@ -29,13 +29,7 @@ _CALIBRATION, _POSES, _SCANS = "data_odometry_calib.zip", "data_odometry_poses.z
 _NAME = re.compile(r"\d\d")
 _CHUNK = 1 << 20
 _TIMEOUT_S = 30.0
-_ATTEMPTS = 3
-
-T = TypeVar("T")
-
-
-class _BrokenError(DownloadError):
-    """The connection broke: another attempt may do."""
+_RETRIES = 3  # of a connection that is refused or lost before an answer
 
 
 def download_kitti(
@@ -91,7 +85,7 @@ class _RemoteZip:
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self._archive: Any = _retried(self._open)
+        self._archive = self._open()
 
     def matching(self, *prefixes: str) -> list[zipfile.ZipInfo]:
         """Files whose names begin with one of the prefixes, in the order in which they are stored.
@@ -112,25 +106,27 @@ class _RemoteZip:
         """Write one member under a folder; one that is there with the same size and CRC stays.
 
         Raises:
-            DownloadError: the connection broke three times, the CRC is wrong, or the file cannot be written.
+            DownloadError: the connection broke, the CRC is wrong, or the file cannot be written.
         """
         path = folder / member.filename
         if not _is_whole(path, member):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _retried(lambda: write_atomically(path, lambda part: self._copy(member, part), DownloadError, sync=False))
+            write_atomically(path, lambda part: self._copy(member, part), DownloadError, sync=False)
 
     def _copy(self, member: zipfile.ZipInfo, path: Path) -> None:
-        archive, self._archive = self._archive or self._open(), None  # after a failure it is opened again
-        with self._errors(f"{member.filename} broke off"), archive.open(member) as source, path.open("wb") as file:
+        broken = self._errors(f"{member.filename} broke off")
+        with broken, self._archive.open(member) as source, path.open("wb") as file:
             shutil.copyfileobj(source, file, _CHUNK)
-        self._archive = archive
 
     def _open(self) -> Any:
         remotezip, requests, _ = import_extra("download")
         options = {"timeout": _TIMEOUT_S, "headers": {"Accept-Encoding": "identity"}}
+        session = requests.Session()
+        for scheme in ("http://", "https://"):
+            session.mount(scheme, requests.adapters.HTTPAdapter(max_retries=_RETRIES))
         with self._errors("cannot be read"):
             try:
-                return remotezip.RemoteZip(self.url, session=requests.Session(), **options)
+                return remotezip.RemoteZip(self.url, session=session, **options)
             except remotezip.RangeNotSupported as error:
                 raise DownloadError(
                     f"{self.url}: the server gives no parts of files (HTTP ranges): fetch the whole file there"
@@ -148,17 +144,7 @@ class _RemoteZip:
         except broken as error:
             if isinstance(error.__context__, ValueError):  # what requests says of an address without server
                 raise DownloadError(f"{self.url} is no address: give --mirror as https://HOST/FOLDER") from error
-            raise _BrokenError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
-
-
-def _retried(attempt: Callable[[], T]) -> T:
-    """The result of an attempt; after a broken connection there are two more."""
-    for _ in range(_ATTEMPTS - 1):
-        try:
-            return attempt()
-        except _BrokenError:
-            continue
-    return attempt()
+            raise DownloadError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
 
 
 def _is_whole(path: Path, member: zipfile.ZipInfo) -> bool:

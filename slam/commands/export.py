@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -25,32 +25,27 @@ from slam.runtime.errors import RunError
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
 
 # from a camera's x right, y down, z ahead
-R_UP_WORLDS: dict[str, FloatArray] = {
+R_UP_WORLDS: dict[Up, FloatArray] = {
     "y-down": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # x right, y ahead, z up
-}
-_OPTIONS: dict[str, tuple[str, ...]] = {
-    "mesh": (),
-    "cloud": (),
-    "colmap": ("dataset", "points"),
-    "nerfstudio": ("dataset",),
-    "occupancy": ("resolution",),
 }
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
 _SCENES = {
     "colmap": ("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), is_own_model),
     "nerfstudio": ("a scene", ("images", POINTS, TRANSFORMS), is_own_scene),
 }
-_RESOLUTION = 0.1  # of an occupancy grid
+RESOLUTION = 0.1  # of an occupancy grid
+What = Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"]
+Up = Literal["y-down", "z"]
 
 
 def export(
     folder: RunFolder,
-    what: str,
+    what: What,
     output: Path,
-    up: str = "y-down",
+    up: Up = "y-down",
     *,
-    resolution: float | None = None,
+    resolution: float = RESOLUTION,
     dataset: Path | None = None,
     points: int | None = None,
     progress: Progress = silent,
@@ -73,15 +68,14 @@ def export(
         What was written.
 
     Raises:
-        SlamError: an option that is unknown or has no effect, a part that the run lacks or that is damaged, images
-            that are not found, or a file that cannot be written.
+        SlamError: a part that the run lacks or that is damaged, images that are not found, or a file that cannot be
+            written.
     """
-    _check_options(what, up, resolution, dataset, points)
     _check_target(what, output)
     if what in _MAPS:
         write_ply(output, _map(folder, what, up))
     elif what == "occupancy":
-        return _export_occupancy(folder, output, resolution or _RESOLUTION)
+        return _export_occupancy(folder, output, resolution)
     else:
         trajectory = _trajectory(folder, up)
         cloud = _map(folder, "cloud", up) if (folder.path / MAP_CLOUD).is_file() else None
@@ -90,22 +84,6 @@ def export(
         else:
             write_scene(folder, output, trajectory, cloud, dataset, progress)
     return output
-
-
-def _check_options(what: str, up: str, resolution: float | None, dataset: Path | None, points: int | None) -> None:
-    """Refuse what does not exist, has no effect or makes no sense."""
-    if what not in _OPTIONS:
-        raise RunError(f"--what {what!r} is unknown: choose one of {', '.join(_OPTIONS)}")
-    if up not in R_UP_WORLDS:
-        raise RunError(f"--up {up!r} is unknown: choose {' or '.join(R_UP_WORLDS)}")
-    for name, value in {"resolution": resolution, "dataset": dataset, "points": points}.items():
-        if value is not None and name not in _OPTIONS[what]:
-            takers = ", ".join(taker for taker, options in _OPTIONS.items() if name in options)
-            raise RunError(f"--{name} does nothing for {what}: it is for {takers}")
-    if resolution is not None and not (math.isfinite(resolution) and resolution > 0):
-        raise RunError(f"--resolution {resolution} must be a positive length")
-    if points is not None and points < 1:
-        raise RunError(f"--points {points} is too few: give 1 or more")
 
 
 def _check_target(what: str, output: Path) -> None:
@@ -143,7 +121,7 @@ def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Pat
     return written
 
 
-def _map(folder: RunFolder, what: str, up: str) -> Ply:
+def _map(folder: RunFolder, what: str, up: Up) -> Ply:
     """The mesh or cloud of the map in the given axes."""
     ply = read_ply(folder.require(_MAPS[what]))
     if len(ply.vertices) == 0 or (ply.triangles is not None and len(ply.triangles) == 0):
@@ -151,7 +129,7 @@ def _map(folder: RunFolder, what: str, up: str) -> Ply:
     return ply if up == "y-down" else rotated(ply, R_UP_WORLDS[up])
 
 
-def _trajectory(folder: RunFolder, up: str) -> Trajectory:
+def _trajectory(folder: RunFolder, up: Up) -> Trajectory:
     """The optimised trajectory in the given axes."""
     folder.require(ESTIMATE)
     trajectory = folder.trajectory("optimised")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.common.readers.images import image_folder, list_images, read_image
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
-from slam.config.sections import LoopsConfig, load_stored
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.geometry.resection import consensus, resect
@@ -26,10 +26,10 @@ from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.structure import PlaceStructure
-from slam.loops.verification import OF_KEYFRAMES, LoopThresholds, matches
+from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
-from slam.runtime.run_files import CONFIG, PLACES
+from slam.runtime.run_files import PLACES
 from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
 from slam.sequences.excerpt import frame_range
 from slam.sequences.images import ImageFiles
@@ -49,9 +49,13 @@ _ASPECT_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Localisation:
-    """The pose ``T_world_camera`` of an image in the unit of the map; or None and the reason."""
+    """The pose ``T_world_camera`` of an image in the unit of the map; or None and the reason.
+
+    ``number`` is that of the image among those of its folder.
+    """
 
     image: str
+    number: int = 0
     T_world_camera: FloatArray | None = None
     nearest_frame: int | None = None
     inliers: int = 0
@@ -68,32 +72,30 @@ class Localisation:
         return entry | pose | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
 
 
-def image_numbers(images: Path, frames: str | None = None, every: int = 1) -> range:
-    """Numbers of the images to localise, from 0: every n-th of ``A:B``, half-open.
-
-    Raises:
-        SequenceError: no images, or the range is empty or reaches beyond them.
-    """
-    first, last = frame_range(frames or ":", len(image_paths(images)))
-    return range(first, last, every)
-
-
 def localise(
-    images: Path, run: RunFolder, camera: Path | None = None, numbers: range | None = None
-) -> Iterator[Localisation]:
+    images: Path,
+    run: RunFolder,
+    camera: Path | None = None,
+    frames: str | None = None,
+    every: int = 1,
+    progress: Progress = silent,
+) -> list[Localisation]:
     """Localise images in the map of a run, one after the other.
 
     Args:
         images: an image or a folder of images.
         run: a finished run with loops switched on.
         camera: their ``camera.yaml``; None for the one beside them or their folder, or else the camera of the run.
-        numbers: of the images to localise; None for all of them.
+        frames: ``A:B``, half-open, of the images in their order; None for all.
+        every: of these, every n-th.
+        progress: called with (stage, done, total).
 
     Raises:
-        SlamError, DataError: no images, no places in the run, a camera file that does not fit, or none where the run
-            undistorted its images.
+        SlamError, DataError: no images or none that can be read, no places in the run, a camera file that does not fit,
+            or none where the run undistorted its images.
     """
-    paths = image_paths(images)
+    paths = _image_paths(images)
+    first, last = frame_range(frames or ":", len(paths))
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
@@ -103,23 +105,22 @@ def localise(
             f"{run.path} undistorted its images, and {images} has no {CAMERA_FILE}: give its --camera, which is fov=70 "
             "for images without distortion"
         )
-    localiser = Localiser(
-        places,
-        load_stored(run.require(CONFIG), "loops").loops,
-        None if own_camera is None else intrinsics_of(own_camera),
-    )
+    localiser = Localiser(places, None if own_camera is None else intrinsics_of(own_camera))
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
-    chosen = paths if numbers is None else [paths[number] for number in numbers]
-    unreadable = 0
-    for path in chosen:
+    numbers, found, unreadable = range(first, last, every), [], 0
+    for number in numbers:
+        name = paths[number].name
         try:
-            image = read_image(path)
-            yield localiser.locate(path.name, image if undistortion is None else undistortion.apply(image))
+            image = read_image(paths[number])
+            image = image if undistortion is None else undistortion.apply(image)
+            found.append(replace(localiser.locate(name, image), number=number))
         except (DataError, SequenceError) as error:
             unreadable += isinstance(error, DataError)
-            if unreadable == len(chosen):
+            if unreadable == len(numbers):
                 raise  # not one of them is an image
-            yield Localisation(path.name, reason=str(error))
+            found.append(Localisation(name, number, reason=str(error)))
+        progress("images", len(found), len(numbers))
+    return found
 
 
 def localisation_table(found: Sequence[Localisation]) -> Table:
@@ -136,16 +137,15 @@ def localisation_table(found: Sequence[Localisation]) -> Table:
     return Table(head, rows, f"{len(found) - len(notes)} of {len(found)} images found", notes)
 
 
-def write_localisations(path: Path, found: Sequence[Localisation], numbers: Sequence[int] | None = None) -> None:
+def write_localisations(path: Path, found: Sequence[Localisation]) -> None:
     """Write the poses found: as TUM, or after the number of their frame as KITTI where the name ends in ``.kitti``.
 
-    The stamp, or number, is that of the image, by default its place in the list.
+    The stamp, or number, is that of the image.
 
     Raises:
         RunError: no image was found.
     """
-    stamps = range(len(found)) if numbers is None else numbers
-    poses = {k: each.T_world_camera for k, each in zip(stamps, found, strict=True) if each.T_world_camera is not None}
+    poses = {each.number: each.T_world_camera for each in found if each.T_world_camera is not None}
     if not poses:
         raise RunError(f"none of {len(found)} images was found in the map: {path} is not written")
     write = write_kitti if path.suffix == ".kitti" else write_tum
@@ -155,16 +155,15 @@ def write_localisations(path: Path, found: Sequence[Localisation], numbers: Sequ
 class Localiser:
     """Localises single images among the places of one run; no network is used."""
 
-    def __init__(self, places: Places, config: LoopsConfig, intrinsics: Intrinsics | None = None) -> None:
+    def __init__(self, places: Places, intrinsics: Intrinsics | None = None) -> None:
         """Index the places.
 
         Args:
             places: of an old run, at least one view.
-            config: thresholds, those of the run's own loops.
             intrinsics: of the new images; None for those of the run, with images resized to it.
         """
         self._places = places
-        self._thresholds = replace(LoopThresholds.of_frames(config), max_hamming=OF_KEYFRAMES.max_hamming)
+        self._thresholds = replace(OF_FRAMES, max_hamming=OF_KEYFRAMES.max_hamming)
         self._resizes = intrinsics is None
         self._intrinsics = intrinsics or places.intrinsics
         self._features = FeatureExtractor(self._intrinsics)
@@ -272,7 +271,7 @@ class Localiser:
         return points[best[corners]], view.pixels[corners].astype(np.float64)
 
 
-def image_paths(images: Path) -> list[Path]:
+def _image_paths(images: Path) -> list[Path]:
     """One image, or the images of a folder in their order.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from pathlib import Path
 
 import cv2
@@ -24,7 +23,7 @@ from slam.loops.verification import OF_KEYFRAMES
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import PLACES
-from slam.runtime.storage.files import remove, write_atomically
+from slam.runtime.storage.files import write_atomically
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 
@@ -32,7 +31,6 @@ logger = logging.getLogger(__name__)
 
 POINTS = "points.ply"
 _IMAGES = "images"
-_IMAGE = re.compile(r"\d{6,}\.png")
 _SAME_STAMP_S = 2e-3
 _SAME_PIXEL = 0.01
 _GREY = 128
@@ -87,13 +85,11 @@ def write_scene(
 ) -> None:
     """Write ``images/``, ``points.ply`` and, last, ``transforms.json``; arguments and errors as of `write_model`.
 
-    Frames without a usable image are left out; images and points of a scene before go, files of other names stay.
+    Frames without a usable image are left out.
     """
     sequence, written = _write_images(folder, output, trajectory, dataset, progress)
     poses = {_image_name(k): trajectory.T_world_camera[k] for k in written}
-    if cloud is None:
-        remove(output / POINTS, RunError)
-    else:
+    if cloud is not None:
         write_ply(output / POINTS, cloud)
     write_transforms(output / TRANSFORMS, sequence.intrinsics, poses, None if cloud is None else POINTS)
 
@@ -119,7 +115,7 @@ def _tracked(places: Places, at_most: int | None) -> tuple[FloatArray, Sightings
 def _write_images(
     folder: RunFolder, output: Path, trajectory: Trajectory, dataset: Path | None, progress: Progress
 ) -> tuple[Sequence, list[int]]:
-    """Write ``images/NNNNNN.png`` of all frames with a usable image, which are returned; others of such a name go."""
+    """Write ``images/NNNNNN.png`` of all frames with a usable image, which are returned."""
     sequence, rows = _recording(folder, trajectory, dataset)
     written, without = [], _interpolated(folder)
     for k, row in enumerate(rows):
@@ -136,10 +132,6 @@ def _write_images(
         raise RunError(f"no image of {folder.path} can be read: check the data set")
     if len(written) < len(rows):
         logger.warning("%d of %d frames have no usable image: left out", len(rows) - len(written), len(rows))
-    names = {_image_name(k) for k in written}
-    for path in (output / _IMAGES).glob("*.png"):
-        if _IMAGE.fullmatch(path.name) and f"{_IMAGES}/{path.name}" not in names:
-            remove(path, RunError)
     return sequence, written
 
 

@@ -5,51 +5,26 @@ A YAML file may leave keys out, which then have their defaults; ``configs/slam/d
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PositiveFloat, field_validator, model_validator
 
 import erfsfm.common.errors
-from erfsfm.common.config_tree import Section
-from erfsfm.common.config_tree import dump_explained as dump_yaml
+from erfsfm.common.config_tree import Section, dump_explained
 from erfsfm.common.config_tree import load_config as load_tree
-from slam.config.frontend import (
-    GapsConfig,
-    GpsConfig,
-    KeyframesConfig,
-    LidarConfig,
-    RoadConfig,
-    ScaleConfig,
-    ScaleMode,
-    VisualOdometryConfig,
-)
 from slam.runtime.errors import ConfigError
 from slam.runtime.imports import plug_ins
 
-__all__ = [
-    "DepthConfig",
-    "GapsConfig",
-    "GpsConfig",
-    "KeyframesConfig",
-    "LidarConfig",
-    "LoopsConfig",
-    "MappingConfig",
-    "OutputConfig",
-    "RoadConfig",
-    "ScaleConfig",
-    "ScaleMode",
-    "SlamConfig",
-    "VisualOdometryConfig",
-    "dump_yaml",
-    "load_config",
-]
-
 _HERE = Path(__file__).resolve().parents[1]
 _SHIPPED = (_HERE.parent / "configs" / "slam", _HERE / "_configs")  # in the source tree, in the wheel
+dump_yaml = dump_explained  # with the description of every key
 DEPTH_SOURCES = ("onnx", "npy", "png")
 DEPTH_PLUG_INS = "erfsfm_slam.depth"  # entry points of other packages: see docs/depth.md
+
+ScaleMode = Literal["none", "camera-height", "lidar", "reference", "known", "gps"]
 
 
 class DepthConfig(Section):
@@ -76,7 +51,7 @@ class DepthConfig(Section):
         default=None,
         description="onnx: mean of RGB in [0, 1], which is subtracted; null for ONNX files of erfsfm export",
     )
-    std: tuple[float, float, float] | None = Field(
+    std: tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None = Field(
         default=None, description="onnx: standard deviation, by which RGB less the mean is divided; null likewise"
     )
     height: int = Field(default=0, ge=0, description="onnx: height of the input; 0 if the file fixes it")
@@ -112,12 +87,82 @@ class DepthConfig(Section):
             raise ValueError(", ".join(("network, onnx:FILE, npy:FOLDER or png:FOLDER", *(f"{n}:..." for n in others))))
         return source
 
-    @field_validator("std")
+
+class VisualOdometryConfig(Section):
+    """Relative poses from tracked corners, see ``frontend/visual/odometry.py``."""
+
+    enabled: bool = Field(default=True, description="measure relative poses by image geometry")
+
+
+class RoadConfig(Section):
+    """Step lengths from the homography of the ground plane, see ``frontend/scale/road_homography.py``."""
+
+    enabled: bool = Field(
+        default=True, description="measure steps by the homography of the ground plane, in camera heights"
+    )
+
+
+class KeyframesConfig(Section):
+    """Keyframes with bundle adjustment, see ``frontend/keyframes/odometry.py``."""
+
+    use: Literal["auto", "always", "never"] = Field(
+        default="auto",
+        description="auto: unless a camera height is known or the first steps are a vehicle's; never: steps only",
+    )
+
+
+class GapsConfig(Section):
+    """Gap interpolation over unusable frames, see ``frontend/gap_interpolation.py`` and ``frontend/image_gate.py``."""
+
+    enabled: bool = Field(
+        default=True,
+        description="interpolate over unusable frames; false: measure them like other frames, which may end the run",
+    )
+    max_unread_frames: int = Field(
+        default=30, ge=1, description="largest number of consecutive unreadable images; more end the run"
+    )
+
+
+class LidarConfig(Section):
+    """LiDAR odometry, see ``frontend/lidar_odometry.py``. Without factors it is only compared."""
+
+    factors: bool = Field(default=False, description="add kiss-icp's odometry to the pose graph")
+
+
+class GpsConfig(Section):
+    """A GPS track beside the images, see ``docs/gps.md``."""
+
+    factors: bool = Field(default=True, description="add the positions to the pose graph; false: only compare them")
+    sigma_m: float = Field(default=2.5, gt=0, description="sigma of a fix east and north where its HDOP is 1, metres")
+    vertical_sigma_m: float = Field(default=5.0, gt=0, description="sigma of the height of a fix, metres")
+    correlation_s: float = Field(default=10.0, ge=0, description="time for which fixes share their error, seconds")
+    offset_s: float = Field(default=0.0, description="added to the stamps of the fixes, seconds")
+
+
+class ScaleConfig(Section):
+    """Metric scale, see ``frontend/scale/road_plane.py``."""
+
+    mode: Literal["auto", "none", "camera-height", "lidar", "reference", "known", "gps"] = Field(
+        default="auto", description="auto: camera-height where a height is known, else gps with --gps, else none"
+    )
+    known_m: float | None = Field(default=None, gt=0, description="mode known: distance of the two frames, metres")
+    known_between: tuple[int | str, int | str] | None = Field(
+        default=None, description="mode known: two frames of the run, or stamps in seconds such as 12.5s"
+    )
+
+    @field_validator("known_between")
     @classmethod
-    def _positive(cls, std: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if std is not None and min(std) <= 0:
-            raise ValueError("three numbers above 0")
-        return std
+    def _frames_or_stamps(cls, ends: tuple[int | str, int | str] | None) -> tuple[int | str, int | str] | None:
+        for end in ends or ():
+            if (end < 0) if isinstance(end, int) else not re.fullmatch(r"-?\d+(\.\d*)?s", end):
+                raise ValueError("two frame numbers, or stamps in seconds such as 12.5s")
+        return ends
+
+    @model_validator(mode="after")
+    def _known_is_given(self) -> Self:
+        if self.mode == "known" and (self.known_m is None or self.known_between is None):
+            raise ValueError("known_m and known_between beside mode known")
+        return self
 
 
 class LoopsConfig(Section):
@@ -125,42 +170,20 @@ class LoopsConfig(Section):
 
     enabled: bool = Field(default=True, description="detect and close loops")
     frame_stride: int = Field(default=4, ge=1, description="frames between those that are described and compared")
-    min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
 
 
 class MappingConfig(Section):
     """The map, see ``docs/design/map.md``. Without metres, all lengths here follow the depth of the scene."""
 
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
-    frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
     keyframe_distance_m: float = Field(default=1.5, ge=0, description="distance between keyframes, metres")
-    width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel, metres")
     truncation_voxels: float = Field(
         default=10.0, ge=1, description="truncation distance of the signed distance, voxels"
     )
-    sky_brightness: int = Field(
-        default=245,
-        ge=1,
-        le=256,
-        description="least level of all colours of sky, above the horizon and connected to the upper border",
-    )
-    sky_blueness: int = Field(
-        default=15, ge=1, le=256, description="or least blue less red of such a pixel, grey levels; 256: off"
-    )
     depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth, metres")
-    depth_max_m: float = Field(default=20.0, gt=0, description="largest fused depth, metres")
-    certain_sigma_m: float = Field(
-        default=1.2, ge=0, description="largest sigma of depth that is fused beyond depth_max_m, metres"
-    )
-    certain_range_factor: float = Field(
-        default=1.4, ge=1, description="such depth is fused up to this multiple of depth_max_m"
-    )
-    border: float = Field(
-        default=0.02,
-        ge=0,
-        lt=0.5,
-        description="width of the left, right and upper border that is left out, over the image's width",
+    depth_max_m: float = Field(
+        default=20.0, gt=0, description="largest fused depth, metres; up to 1.4 times that where it is certain"
     )
     hood_crop: float = Field(
         default=0.0,
@@ -168,36 +191,23 @@ class MappingConfig(Section):
         lt=1,
         description="height of the lower part with the car's own hood that is left out, over the image's height",
     )
-    max_depth_step: float = Field(
-        default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
-    )
-    max_depth_difference: float = Field(
-        default=0.1, gt=0, description="largest relative difference to the depth of a neighbouring keyframe"
-    )
     max_relative_sigma: float = Field(default=0.3, gt=0, description="largest sigma of fused depth, over the depth")
-    min_weight: float = Field(
-        default=1.0, ge=0, description="least number of observations of a voxel that becomes surface"
-    )
-    min_component_triangles: int = Field(
-        default=300, ge=0, description="least number of triangles of a connected piece of the mesh"
-    )
     close_holes_m: float = Field(
         default=1.5, ge=0, description="largest diameter of a hole of the road that is closed, metres"
     )
-    submap_m: float = Field(default=60.0, gt=0, description="length of the road in a submap, metres")
     memory_mb: int = Field(
-        default=1000, ge=100, description="memory of the map, MiB; a submap that would need more ends before submap_m"
+        default=1000, ge=100, description="memory of the map, MiB; a submap ends before it takes more"
     )
+
+    @property
+    def reach_m(self) -> float:
+        """Depth up to which anything is fused: where its sigma is small, beyond ``depth_max_m``."""
+        return 1.4 * self.depth_max_m
 
     def in_unit(self, per_metre: float) -> MappingConfig:
         """The same lengths in a unit of which a metre has ``per_metre``."""
         lengths = {name: per_metre * getattr(self, name) for name in type(self).model_fields if name.endswith("_m")}
         return self.model_copy(update=lengths)
-
-    @property
-    def reach_m(self) -> float:
-        """Depth up to which anything is fused."""
-        return self.depth_max_m * self.certain_range_factor
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
@@ -242,21 +252,7 @@ def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str]
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.
     """
-    return _load(file_or_name, overrides)
-
-
-def load_stored(path: Path, *sections: str) -> SlamConfig:
-    """Sections of the configuration that a run has kept; the others, which are not read, have their defaults.
-
-    A run of an earlier release may have keys that are gone: they are left out. Raises as `load_config`.
-    """
-    return _load(path, (), sections)
-
-
-def _load(
-    file_or_name: str | Path | None, overrides: Sequence[str], sections: Collection[str] | None = None
-) -> SlamConfig:
     try:
-        return load_tree(SlamConfig, file_or_name, overrides, _SHIPPED, sections)
+        return load_tree(SlamConfig, file_or_name, overrides, _SHIPPED)
     except erfsfm.common.errors.ConfigError as error:
         raise ConfigError(str(error)) from error

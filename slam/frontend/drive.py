@@ -10,7 +10,6 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from slam.config.sections import MappingConfig
 from slam.frames import (
     DepthMap,
     Ends,
@@ -37,6 +36,7 @@ from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
 
+MAP_WIDTH_PX = 416  # of the depth that is fused: that of the networks
 DOUBLED = "the image repeats the one before while the camera moves"
 
 
@@ -49,10 +49,10 @@ class Keyframe:
     spilled_depth: SpilledArray
 
     @classmethod
-    def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile, config: MappingConfig) -> Keyframe:
-        """Thin a frame and its depth, of any size, to about ``width_px`` and spill both."""
+    def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile) -> Keyframe:
+        """Thin a frame and its depth, of any size, to at most ``MAP_WIDTH_PX`` and spill both."""
         height, width = frame.image.shape[:2]
-        ratio = min(config.width_px / width, 1.0)
+        ratio = min(MAP_WIDTH_PX / width, 1.0)
         size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
         image, depth = frame.image, depth_unscaled
         if depth.shape[::-1] != size:

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Grey, Mask, nearest, resized_mask
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.geometry.se3 import FloatArray
@@ -56,6 +55,7 @@ class Texture(NamedTuple):
 
 OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
 OF_KEYFRAMES = Search(side=15, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
+MAX_CORNERS, CORNER_SPACING_PX = 800, 11.0  # of a step: twice as many change no error and take twice the time
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
@@ -188,8 +188,7 @@ class Corners:
 class CornerTracker:
     """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
-    def __init__(self, config: VisualOdometryConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._corners: dict[int, Corners] = {}  # of the last frames
         self._next_track_id = 0
         self._frames_kept = ROTATION_BASELINE + 2
@@ -251,11 +250,11 @@ class CornerTracker:
 
     def _filled(self, frame: Frame, arrived: Corners, standing: Mask | None) -> Corners:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
-        config, next_id = self._config, self._next_track_id
+        next_id = self._next_track_id
         pixels, track_ids = arrived.pixels, arrived.track_ids
-        room = config.max_corners - len(pixels)
+        room = MAX_CORNERS - len(pixels)
         if room > 0:
-            texture = Texture(_STEP_QUALITY, config.corner_spacing_px, _STEP_BLOCK_PX)
+            texture = Texture(_STEP_QUALITY, CORNER_SPACING_PX, _STEP_BLOCK_PX)
             fresh = new_corners(frame.grey, pixels, room, texture, standing)
             pixels = np.concatenate([pixels, fresh])
             track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])

@@ -15,7 +15,7 @@ from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray
 from slam.loops.consistency import Track, agreeing
 from slam.loops.retrieval import Apart, find_candidates
-from slam.loops.verification import Loop, LoopThresholds, LoopVerifier, RejectedLoop
+from slam.loops.verification import OF_FRAMES, Loop, LoopVerifier, RejectedLoop
 from slam.runtime.threads import side_by_side
 
 logger = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ def close_loops(
         is_later = frames[rows, None] - frames >= _LEAST_GAP_FRAMES
         return np.asarray(is_later & (track.path[frames][rows, None] - track.path[frames] >= least))
 
-    closures = find_loops(views, track, apart, LoopVerifier(LoopThresholds.of_frames(config), intrinsics, seed))
+    closures = find_loops(views, track, apart, LoopVerifier(OF_FRAMES, intrinsics, seed))
     return replace(closures, accepted=tuple(_counted_once(closures.accepted, track.path, _SAME_PLACE * least)))
 
 

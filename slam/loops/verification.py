@@ -6,13 +6,12 @@ All thresholds are independent of scale: pixels, ratios, degrees, and lengths ov
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
 from slam.geometry.resection import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_angle
@@ -30,7 +29,7 @@ _LEAST_SCALES = 8  # corners with points in both views, which give the ratio of 
 class LoopThresholds:
     """Independent of scale: pixels, ratios, degrees. Distances and drift of support are by frames or by keyframes."""
 
-    min_inliers: int  # in each direction
+    min_inliers: int = 20  # in each direction
     agreement_deg: float = 2.0  # of the rotations measured in both directions
     agreement_ratio: float = 0.1  # of the translations, over the depth
     min_support: int = 2  # images with loops nearby that agree
@@ -48,12 +47,8 @@ class LoopThresholds:
     translation_floor_ratio: float = 0.0003  # of the sigmas, over the depth
     has_units: bool = False  # the points of both views may have different units
 
-    @classmethod
-    def of_frames(cls, config: LoopsConfig) -> Self:
-        """The conditions of loops between frames of a drive."""
-        return cls(config.min_inliers)
 
-
+OF_FRAMES = LoopThresholds()
 # keyframes' points are exact within a map that drifts, their descriptors further apart in distance and roll
 OF_KEYFRAMES = LoopThresholds(
     min_inliers=15,

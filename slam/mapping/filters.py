@@ -14,6 +14,13 @@ from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics, Mask
 from slam.geometry.se3 import FloatArray, invert
 
+# chosen on simulated streets and on drive 0013, see docs/design/map.md
+_CERTAIN_SIGMA = 0.06  # of depth that is fused beyond the largest depth, over that
+_BORDER = 0.02  # left, right and above, over the image's width
+_SKY_BRIGHTNESS = 245  # least level of all colours of sky
+_SKY_BLUENESS = 15  # or least blue less red of such a pixel, grey levels
+_MAX_DEPTH_STEP = 0.12  # relative, between neighbouring pixels of one surface
+_MAX_DEPTH_DIFFERENCE = 0.1  # relative, to the depth of a neighbouring keyframe
 _OUTSIDE = -9.0  # a column left of every image
 _DARK_BLUE = 110  # grey levels below which nothing is the sky by day
 _MOST_SIGMA = 1e3  # relative, in place of infinity where depth is unknown
@@ -48,7 +55,7 @@ class DepthFilters:
             intrinsics.rays(intrinsics.pixel_grid()).reshape(-1, 3).T, dtype=np.float32
         )  # (3, H*W) with z = 1
         height, width = intrinsics.height, intrinsics.width
-        border, self._above_hood = round(config.border * width), np.ones((height, width), dtype=bool)
+        border, self._above_hood = round(_BORDER * width), np.ones((height, width), dtype=bool)
         self._top_rows = border + 1
         self._inside = np.zeros((height, width), dtype=bool)
         self._inside[border:, border : width - border] = True
@@ -74,7 +81,7 @@ class DepthFilters:
         everything = np.ones(depth.shape, dtype=bool)
         sigma = np.full_like(depth, np.nan) if view.relative_sigma is None else view.relative_sigma
         is_exact = sigma < _EXACT
-        is_sure = depth * np.minimum(sigma, _MOST_SIGMA) <= config.certain_sigma_m
+        is_sure = depth * np.minimum(sigma, _MOST_SIGMA) <= _CERTAIN_SIGMA * config.depth_max_m
         farthest = np.where(is_sure, config.reach_m, config.depth_max_m)
         masks = (
             depth > 0,
@@ -83,7 +90,7 @@ class DepthFilters:
             ~self._is_sky(view.image) | is_exact,
             (depth >= config.depth_min_m) & (depth < farthest),
             everything if view.relative_sigma is None else sigma <= config.max_relative_sigma,
-            ~_at_edges(self.trusted(view), config.max_depth_step) | is_exact,
+            ~_at_edges(self.trusted(view), _MAX_DEPTH_STEP) | is_exact,
             np.any([self._agrees(view, other) for other in others], axis=0) if others else everything,
             everything if earlier is None else ~self._is_seen_through(view, earlier),
         )
@@ -116,13 +123,13 @@ class DepthFilters:
 
         A facade and its windows may be as bright or blue, but have a roof above them.
         """
-        config, horizon = self._config, int(np.clip(self._camera.cy, 0, image.shape[0]))
+        horizon = int(np.clip(self._camera.cy, 0, image.shape[0]))
         sky = np.zeros(image.shape[:2], dtype=bool)
         if not horizon:
             return sky
         red, green, blue = (each.astype(np.int16) for each in cv2.split(image[:horizon]))
-        is_blue = (blue - red >= config.sky_blueness) & (blue > _DARK_BLUE)
-        sky[:horizon] = (cv2.min(cv2.min(red, green), blue) >= config.sky_brightness) | is_blue
+        is_blue = (blue - red >= _SKY_BLUENESS) & (blue > _DARK_BLUE)
+        sky[:horizon] = (cv2.min(cv2.min(red, green), blue) >= _SKY_BRIGHTNESS) | is_blue
         pieces, piece = cv2.connectedComponents(sky.view(np.uint8), connectivity=4)
         is_above = np.zeros(pieces, dtype=bool)
         is_above[piece[: self._top_rows]] = True
@@ -133,7 +140,7 @@ class DepthFilters:
         """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
         u, v, z = self.projected(view, other)
         there = sampled(self.trusted(other), u, v)
-        return np.asarray(np.abs(there - z) < np.float32(self._config.max_depth_difference) * z)
+        return np.asarray(np.abs(there - z) < np.float32(_MAX_DEPTH_DIFFERENCE) * z)
 
     def _is_seen_through(self, view: KeyframeDepth, earlier: KeyframeDepth) -> Mask:
         """Pixels ``(H, W)`` of pieces behind which the earlier view sees something."""

@@ -24,6 +24,7 @@ from slam.runtime.storage.spill import SpillFile
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
+_SUBMAP_LENGTH = 3.0  # largest depths after which a submap ends: 60 m of a street
 _EARLIER = 3  # views between one and that which tells what has come since
 _KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 
@@ -138,7 +139,7 @@ class TsdfMap:
         self._fused += 1
         self._surface = None
         is_large = self._growing.blocks * _BLOCK_MB >= _FUSION_SHARE * config.memory_mb
-        if is_large or self._growing.length >= config.submap_m:
+        if is_large or self._growing.length >= _SUBMAP_LENGTH * config.depth_max_m:
             self._finish_submap()
 
     def _finish_submap(self) -> None:

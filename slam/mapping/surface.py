@@ -25,6 +25,8 @@ from slam.mapping.views import Painter
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 
+_LEAST_WEIGHT = 1.0  # observations of a voxel that becomes surface
+_LEAST_TRIANGLES = 300  # of a connected piece; smaller ones float
 _LENGTHS, _COLOURS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
 VERTEX = np.dtype([*((name, "<f4") for name in _LENGTHS), *((name, "u1") for name in _COLOURS)])
 _FILLED = np.dtype([*VERTEX.descr, ("filled", "u1")])
@@ -84,13 +86,13 @@ class MapSurface:
         self._spill = SpillFile("the map")
         self._pieces: list[Piece] = []
         self.blocks, self.submaps = submaps.block_count(), submaps.count
-        self._extract(submaps, fused, config, progress)
+        self._extract(submaps, config, progress)
         if not self._pieces:
-            raise EmptyMapError(f"the map is empty: no surface was seen {config.min_weight:g} times")
-        self._rows = _numbered(self._pieces, config.min_component_triangles, self._spill)
+            raise EmptyMapError("the map is empty: no surface was seen")
+        self._rows = _numbered(self._pieces, _LEAST_TRIANGLES, self._spill)
         self.triangles = sum(rows.triangles for rows in self._rows)
         if self.triangles == 0:
-            raise EmptyMapError("the map is empty: no piece of surface is larger than min_component_triangles")
+            raise EmptyMapError(f"the map is empty: no piece of surface is larger than {_LEAST_TRIANGLES} triangles")
         everything = sum(int(piece.sizes.sum()) for piece in self._pieces)
         self.floater_share = 1 - self.triangles / everything
         sizes = [(len(each), int((each["filled"] == 0).sum())) for each in self.vertex_pieces()]
@@ -132,12 +134,11 @@ class MapSurface:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
         write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces)
 
-    def _extract(self, submaps: MergedSubmaps, fused: int, config: MappingConfig, progress: Progress) -> None:
+    def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress) -> None:
         painter = Painter(submaps, config.voxel_size_m, config.reach_m)
         tiles = submaps.tiles()
-        least_weight = min(config.min_weight, float(fused))  # with fewer frames nothing would be extracted
         for done, tile in enumerate(tiles, 1):
-            patch = extract_tile(submaps, tile, config.voxel_size_m, least_weight)
+            patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
             if patch is not None:
                 if config.close_holes_m > 0:
                     up = _upwards(submaps, tile, config.voxel_size_m)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 
 import numpy as np
@@ -11,7 +11,7 @@ from erfsfm.common.progress import Progress
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import MappingConfig, SlamConfig
 from slam.frames import Intrinsics
-from slam.frontend.drive import Drive, Keyframe
+from slam.frontend.drive import Drive
 from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
@@ -31,7 +31,7 @@ def fuse(
     intrinsics: Intrinsics,
     config: SlamConfig,
     decide: Decide | None,
-    compare: Callable[[KeyframeDepth], None] | None,
+    compare: Callable[[KeyframeDepth], None],
     progress: Progress,
 ) -> TsdfMap:
     """Learned depth at the optimised poses, refined and fused into one surface.
@@ -47,81 +47,77 @@ def fuse(
         compare: called with the depth of each keyframe that is far enough from the one before.
         progress: called with the stage, done and total.
     """
-    keyframes, T_world_camera = estimate.drive.keyframes, estimate.optimised.T_world_camera
-    height, width = keyframes[0].depth_unscaled.shape
+    drive, scales, T_world_camera = estimate.drive, estimate.scale.per_frame, estimate.optimised.T_world_camera
+    height, width = drive.keyframes[0].depth_unscaled.shape
     intrinsics = intrinsics.resized(width, height)
-    scales, is_carried = estimate.scale.per_frame, bool(estimate.drive.maps)
-    error = DepthError() if is_carried else estimate.depth_error
-    guess_sigma = _ROOM_SIGMA if is_carried and config.depth.is_learned else None
-    depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, decide, guess_sigma)
-    mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
+    is_carried = bool(drive.maps)
+    depth_at = keyframe_depths(
+        drive,
+        scales,
+        T_world_camera,
+        DepthError() if is_carried else estimate.depth_error,
+        intrinsics,
+        decide,
+        _ROOM_SIGMA if is_carried and config.depth.is_learned else None,
+    )
+    mapping = config.mapping if estimate.scale.is_metric else fitted(config.mapping, drive, scales)
     tsdf_map = TsdfMap(mapping, intrinsics)
-    selected = tsdf_map.select([keyframe.index for keyframe in keyframes], T_world_camera)
-    with closing(read_ahead(depths.at, selected, CORES)) as ahead:
+    selected = tsdf_map.select([keyframe.index for keyframe in drive.keyframes], T_world_camera)
+    with closing(read_ahead(depth_at, selected, CORES)) as ahead:
         for done, keyframe in enumerate(estimate.stopwatch.each("depth refinement", ahead), 1):
-            if compare is not None:
-                compare(keyframe)
+            compare(keyframe)
             with estimate.stopwatch.stage("map"):
                 tsdf_map.integrate(keyframe)
             progress("map", done, len(selected))
     return tsdf_map
 
 
-class KeyframeDepths:
-    """Depth of each keyframe of a drive, at the optimised poses."""
+def fitted(mapping: MappingConfig, drive: Drive, scale_per_frame: FloatArray) -> MappingConfig:
+    """The settings with their lengths scaled from a street to this scene, by the median of known depth.
 
-    def __init__(
-        self,
-        drive: Drive,
-        scale_per_frame: FloatArray,
-        T_world_camera: FloatArray,
-        error: DepthError,
-        intrinsics: Intrinsics,
-        decide: Decide | None,
-        guess_sigma: float | None = None,
-    ) -> None:
-        """Prepare.
+    Where no depth is known they stay as they are.
+    """
+    some = np.linspace(0, len(drive.keyframes) - 1, _SOME).round().astype(int)
+    chosen = (drive.keyframes[n] for n in np.unique(some))
+    depths = (each.depth_unscaled * np.float32(scale_per_frame[each.index]) for each in chosen)
+    medians = [np.median(known) for depth in depths if (known := depth[np.isfinite(depth)]).size]
+    return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
 
-        Args:
-            drive: with at least one keyframe.
-            scale_per_frame: factor ``(N,)`` on unscaled depth.
-            T_world_camera: poses of all frames ``(N, 4, 4)``.
-            error: of learned depth on this drive, taken out before depth is refined or fused.
-            intrinsics: of the keyframes.
-            decide: between learned and measured depth; None where it is not refined.
-            guess_sigma: relative sigma of depth that was to be refined and has no neighbours; None where unknown.
-        """
-        self._keyframes: Sequence[Keyframe] = drive.keyframes
-        self._scale, self._T_world_camera, self._error = scale_per_frame, T_world_camera, error
-        self._guess_sigma = None if decide is None else guess_sigma
-        self._refiner: DepthRefiner | None = None
-        if decide is not None:
-            indices = [keyframe.index for keyframe in self._keyframes]
-            self._refiner = DepthRefiner(
-                intrinsics, indices, T_world_camera[indices], lambda n: self._keyframes[n].image, decide
-            )
 
-    def fitted(self, mapping: MappingConfig) -> MappingConfig:
-        """The settings with their lengths scaled from a street to this scene, by the median of known depth.
+def keyframe_depths(
+    drive: Drive,
+    scale_per_frame: FloatArray,
+    T_world_camera: FloatArray,
+    error: DepthError,
+    intrinsics: Intrinsics,
+    decide: Decide | None,
+    guess_sigma: float | None,
+) -> Callable[[int], KeyframeDepth]:
+    """The depth of the n-th keyframe of a drive in the unit of the trajectory, as a function of n.
 
-        Where no depth is known they stay as they are.
-        """
-        some = np.linspace(0, len(self._keyframes) - 1, _SOME).round().astype(int)
-        chosen = (self._keyframes[n] for n in np.unique(some))
-        depths = (each.depth_unscaled * np.float32(self._scale[each.index]) for each in chosen)
-        medians = [np.median(known) for depth in depths if (known := depth[np.isfinite(depth)]).size]
-        return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
+    Args:
+        drive: with at least one keyframe.
+        scale_per_frame: factor ``(N,)`` on unscaled depth.
+        T_world_camera: optimised poses of all frames ``(N, 4, 4)``.
+        error: of learned depth on this drive, taken out before depth is refined or fused.
+        intrinsics: of the keyframes.
+        decide: between learned and measured depth; None where it is not refined.
+        guess_sigma: relative sigma of depth that was to be refined and has no neighbours; None where unknown.
+    """
+    keyframes, refiner = drive.keyframes, None
+    if decide is not None:
+        indices = [keyframe.index for keyframe in keyframes]
+        refiner = DepthRefiner(intrinsics, indices, T_world_camera[indices], lambda n: keyframes[n].image, decide)
 
-    def at(self, n: int) -> KeyframeDepth:
-        """The n-th keyframe in the unit of the trajectory; without a sigma where nothing is known of its error."""
-        keyframe = self._keyframes[n]
-        scale, learned = float(self._scale[keyframe.index]), keyframe.depth_unscaled
-        depth, unbiased = learned * np.float32(scale), (self._error.corrected(learned) * scale).astype(np.float32)
-        refined = None
-        if self._refiner is not None:
-            refined = self._refiner.refine(n, unbiased)
-        image, pose = keyframe.image, self._T_world_camera[keyframe.index]
-        if refined is None:
-            sigma = None if self._guess_sigma is None else np.full_like(unbiased, self._guess_sigma)
-            return KeyframeDepth(keyframe.index, unbiased, sigma, image, pose, depth)
-        return KeyframeDepth(keyframe.index, refined.depth, refined.relative_sigma, image, pose, depth)
+    def depth_at(n: int) -> KeyframeDepth:
+        keyframe = keyframes[n]
+        scale, learned = float(scale_per_frame[keyframe.index]), keyframe.depth_unscaled
+        depth, sigma = (error.corrected(learned) * scale).astype(np.float32), None
+        if refiner is not None and (refined := refiner.refine(n, depth)) is not None:
+            depth, sigma = refined.depth, refined.relative_sigma
+        elif refiner is not None and guess_sigma is not None:
+            sigma = np.full_like(depth, guess_sigma)
+        pose, of_network = T_world_camera[keyframe.index], learned * np.float32(scale)
+        return KeyframeDepth(keyframe.index, depth, sigma, keyframe.image, pose, of_network)
+
+    return depth_at

@@ -15,7 +15,7 @@ from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.local_map import LocalMap, MapSegment
-from slam.frontend.keyframes.odometry import KeyframeOdometry
+from slam.frontend.keyframes.odometry import MAX_CORNERS, KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.scale.road_plane import GroundPlane
@@ -74,7 +74,7 @@ class KeyframeTracking:
         self._cores = ExitStack()
         # the networks, which predict little for keyframes, leave their core to optical flow
         self._cores.enter_context(opencv_threads(usable_cores()))
-        self._odometry: KeyframeOdometry | None = KeyframeOdometry(config, intrinsics, seed, on_keyframe)
+        self._odometry: KeyframeOdometry | None = KeyframeOdometry(intrinsics, seed, on_keyframe)
         self.choose(Drive())
 
     @property
@@ -110,7 +110,7 @@ class KeyframeTracking:
             self._places = Relocaliser(
                 views_of(lost.keyframes, lost.points), T_map_camera, self._intrinsics, self._seed
             )
-        corners = new_corners(frame.grey, np.zeros((0, 2), np.float32), self._config.max_corners)
+        corners = new_corners(frame.grey, np.zeros((0, 2), np.float32), MAX_CORNERS)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
         found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
         if found is None:

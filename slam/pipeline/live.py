@@ -25,7 +25,6 @@ from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH
-from slam.runtime.threads import Turns, in_turn
 from slam.sequences.recording import POSSIBLE_PERIODS_S, GrowingSequence
 
 
@@ -33,8 +32,7 @@ class Slam:
     """Monocular SLAM frame by frame; it keeps no images, unless a map is wanted.
 
     Poses come from the measurements of the last 100 frames; older ones stay, so a frame costs the same however long
-    the drive is. `close_loops` solves the whole drive as `run` does. Threads may share a session: each call waits for
-    the one before.
+    the drive is. `close_loops` solves the whole drive as `run` does. A session is of one thread.
     """
 
     def __init__(
@@ -43,8 +41,6 @@ class Slam:
         intrinsics: Intrinsics,
         config: SlamConfig | None = None,
         camera_height_m: float | None = None,
-        update_frames: int = 10,
-        sweep_frames: int = 0,
         with_map: bool = False,
         seed: int = 0,
     ) -> None:
@@ -55,25 +51,14 @@ class Slam:
             intrinsics: of all images.
             config: None for the defaults; ``mapping.enabled`` has no effect.
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
-            update_frames: lengths of the last steps are solved after so many frames.
-            sweep_frames: the whole drive is solved after so many frames, which takes longer the longer it is; 0: only
-                in ``close_loops``.
             with_map: keep images on disk, for `surface` and `clouds`.
             seed: of all RANSAC draws.
 
         Raises:
-            SlamError: a scale mode that needs more than images, an impossible camera, or a number out of its range.
+            SlamError: a scale mode that needs more than images, or an impossible camera.
         """
-        self._turns = Turns()
-        if not hasattr(predictor, "sources"):
-            raise SlamError(f"predictor must be a Predictor, as in Slam.from_weights; got {type(predictor).__name__}")
-        _check(intrinsics, camera_height_m, config)
+        _require_possible(intrinsics, camera_height_m)
         config = config or SlamConfig()
-        if update_frames < 1 or sweep_frames < 0 or not 0 <= seed < 2**31:
-            raise SlamError(
-                f"wanted update_frames >= 1, sweep_frames >= 0 and a seed of 31 bits; got {update_frames}, "
-                f"{sweep_frames} and {seed}"
-            )
         mapping = config.mapping.model_copy(update={"enabled": with_map})
         config = config.model_copy(update={"mapping": mapping})
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
@@ -81,8 +66,7 @@ class Slam:
         self._pipeline.require_possible()
         self._observer = self._pipeline.observer()
         self._is_closed = False
-        self._poses = LivePoses(predictor.sources, camera_height_m, config, update=update_frames)
-        self._sweep_frames = sweep_frames
+        self._poses = LivePoses(predictor.sources, camera_height_m, config)
         self._newest = LivePose(0, np.eye(4), "starting", None, None)
         self._estimate: Estimate | None = None
 
@@ -102,7 +86,7 @@ class Slam:
             SlamError: as the constructor; a depth source that cannot be opened, or a folder of files.
             ErfsfmError: as ``DepthPosePredictor.from_weights``.
         """
-        _check(intrinsics, camera_height_m, config)
+        _require_possible(intrinsics, camera_height_m)
         prediction = open_prediction(name_or_dir, device, (config or SlamConfig()).depth, intrinsics)
         return cls(prediction.predictor, intrinsics, config, camera_height_m, with_map=with_map)
 
@@ -125,7 +109,6 @@ class Slam:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @in_turn
     def close(self) -> None:
         """Finish every frame so far and end the threads; results stay available."""
         self._is_closed = True
@@ -134,7 +117,6 @@ class Slam:
         finally:
             self._observer.close()
 
-    @in_turn
     def add_frame(self, image: Image, stamp: float) -> LivePose:
         """Process the next frame; the newest one that is finished, which may be the one before, is returned.
 
@@ -148,17 +130,12 @@ class Slam:
         """
         if self._is_closed:
             raise SlamError("this session is closed: make another Slam")
-        size = (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3)
-        shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
-        if not isinstance(image, np.ndarray) or shape != size or kind != np.uint8:
-            raise ValueError(f"image must be {size} uint8; got {shape} {kind}")
-        if not isinstance(stamp, int | float | np.number):
-            raise ValueError(f"a stamp must be a number of seconds; got {stamp!r}")
-        stamp = float(stamp)
-        if not np.isfinite(stamp) or (len(self) and not stamp > self._sequence.stamps[-1]):
-            raise ValueError(f"stamps must increase; got {stamp} after {self._sequence.stamps[-1:].tolist()}")
-        if len(self) and not stamp - self._sequence.stamps[-1] <= POSSIBLE_PERIODS_S[1]:
-            raise ValueError(f"stamps must be seconds; got {stamp} after {self._sequence.stamps[-1]}")
+        size, shape = (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3), np.shape(image)
+        if shape != size or image.dtype != np.uint8:
+            raise ValueError(f"image must be {size} uint8; got {shape} {getattr(image, 'dtype', type(image).__name__)}")
+        since = stamp - self._sequence.stamps[-1] if len(self) else POSSIBLE_PERIODS_S[1]
+        if not (np.isfinite(stamp) and 0 < since <= POSSIBLE_PERIODS_S[1]):
+            raise ValueError(f"stamps must increase, in seconds; got {stamp} after {self._sequence.stamps[-1:]}")
         image = image.copy()  # used again with the next one
         image.setflags(write=False)
         index = len(self)
@@ -168,11 +145,8 @@ class Slam:
             if self._observer.frames > index:
                 self._sequence.stamps = np.append(self._sequence.stamps, stamp)
         self._newest = (self._poses.add(self._observer) or [self._newest])[-1]
-        if self._sweep_frames and len(self) % self._sweep_frames == 0:
-            self.close_loops()
         return self._newest
 
-    @in_turn
     def trajectory(self) -> Trajectory:
         """All frames so far, lengths in `unit_name`; before the first snippet the camera is assumed to stay in place.
 
@@ -185,7 +159,6 @@ class Slam:
         self._poses.add(self._observer)
         return Trajectory(self._sequence.stamps.copy(), self._poses.T_world_camera)
 
-    @in_turn
     def close_loops(self) -> LoopClosures:
         """Solve the whole drive so far with its loops, as ``run`` does; later frames go on from its poses.
 
@@ -200,7 +173,6 @@ class Slam:
         self._estimate = estimate
         return estimate.loops
 
-    @in_turn
     def keyframes(self) -> Trajectory:
         """The frames whose corners `points` gives; the whole drive so far is solved first, as by `close_loops`.
 
@@ -210,7 +182,6 @@ class Slam:
         estimate = self._solved()
         return estimate.optimised.select(np.array([view.index for view in estimate.views], np.intp))
 
-    @in_turn
     def points(self) -> FloatArray:
         """Points ``(M, 3)`` of the corners of `keyframes` in the world, in `unit_name`; raises as `keyframes`.
 
@@ -227,7 +198,6 @@ class Slam:
         points = np.concatenate(of_views)
         return np.asarray(points[np.isfinite(points).all(axis=1)])
 
-    @in_turn
     def marginals(self, frame: int) -> FloatArray:
         """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`, or without one."""
         graph = self._solved().graph
@@ -235,7 +205,6 @@ class Slam:
             raise SlamError(graph.reason)
         return graph.marginal(frame)
 
-    @in_turn
     def surface(self) -> Any:
         """The map of the drive so far as an Open3D ``TriangleMesh``, y down; raises as `keyframes`.
 
@@ -249,7 +218,6 @@ class Slam:
             fused.surface().write_mesh(Path(folder) / MAP_MESH)
             return import_open3d().io.read_triangle_mesh(str(Path(folder) / MAP_MESH))
 
-    @in_turn
     def clouds(self, first: int = 0, stride: int = 4) -> dict[int, FloatArray]:
         """Learned depth of each frame kept since ``first``: points ``(M, 3)`` in its camera, in `unit_name`.
 
@@ -269,15 +237,9 @@ class Slam:
         return self._estimate
 
 
-def _check(intrinsics: Intrinsics, camera_height_m: float | None, config: SlamConfig | None) -> None:
-    """Refuse a camera that cannot be, and settings by their name."""
-    if not isinstance(config, SlamConfig | None):
-        raise SlamError(f"config must be what slam.config.sections.load_config gives; got {type(config).__name__}")
-    if not isinstance(intrinsics, Intrinsics):
-        raise SlamError(f"intrinsics must be slam.frames.Intrinsics; got {type(intrinsics).__name__}")
-    problem = impossible(intrinsics)
-    if problem is not None:
+def _require_possible(intrinsics: Intrinsics, camera_height_m: float | None) -> None:
+    """Refuse a camera that cannot be."""
+    if (problem := impossible(intrinsics)) is not None:
         raise SlamError(f"intrinsics: {problem}")
-    is_number = isinstance(camera_height_m, float | int | None)
-    if not is_number or (camera_height_m is not None and not 0 < camera_height_m <= HIGHEST_M):
+    if camera_height_m is not None and not 0 < camera_height_m <= HIGHEST_M:
         raise SlamError(f"camera_height_m must be metres above the road, to {HIGHEST_M:g}; got {camera_height_m!r}")

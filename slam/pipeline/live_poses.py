@@ -17,6 +17,7 @@ from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.geometry.se3 import FloatArray, compose, invert
 from slam.pipeline.observer import Observer
 
+_WINDOW, _UPDATE = 100, 10  # frames whose poses are solved again, and between two solutions
 _LAST_STEPS = 4  # looked through for that to a frame
 State = Literal["starting", "tracking", "bridged", "relocalised"]
 
@@ -37,33 +38,23 @@ class LivePose:
 
 
 class LivePoses:
-    """Poses from the measurements of the last ``window`` frames; older poses stay as they are.
+    """Poses from the measurements of the last 100 frames; older poses stay as they are.
 
-    Lengths of all steps in the window are solved again every ``update`` frames, in between the newest step is scaled as
+    Lengths of all steps in this window are solved again every tenth frame, in between the newest step is scaled as
     the last one was. Where keyframes measure the camera, only their unit is solved again; where they have lost it, only
     what follows the last frame that they located.
     """
 
-    def __init__(
-        self,
-        sources: int,
-        camera_height_m: float | None,
-        config: SlamConfig,
-        window: int = 100,
-        update: int = 10,
-    ) -> None:
+    def __init__(self, sources: int, camera_height_m: float | None, config: SlamConfig) -> None:
         """Prepare for the first frame.
 
         Args:
             sources: of a snippet.
             camera_height_m: above the road; None where unknown.
             config: of all parts.
-            window: frames whose poses are solved again.
-            update: frames between two solutions.
         """
-        self._sources, self._camera_height_m, self._config = sources, camera_height_m, config
+        self._sources, self._camera_height_m = sources, camera_height_m
         self._mode = resolve_mode(config.scale, camera_height_m)
-        self._window, self._update = window, update
         self.unit_name: str | None = None  # of all lengths, None while unknown
         self._T_world_camera: list[FloatArray] = []
         self._T_previous_newest = np.eye(4)
@@ -90,7 +81,7 @@ class LivePoses:
         first, count = len(self._T_world_camera), len(drive)
         frames = range(first, count)
         unasked = {0, *(index for index in frames if self._step(observer, index))}
-        if drive.snippets and (self._unit is None or count // self._update > first // self._update):
+        if drive.snippets and (self._unit is None or count // _UPDATE > first // _UPDATE):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
         support = frame_support(frames, drive.motions[-_LAST_STEPS * len(frames) :]).tolist()
@@ -135,7 +126,7 @@ class LivePoses:
 
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""
-        first = max(count - self._window, 0)
+        first = max(count - _WINDOW, 0)
         window = observer.drive.since(first)
         if not window.snippets:
             return

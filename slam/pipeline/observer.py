@@ -14,7 +14,7 @@ import numpy as np
 
 from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState, ImageGate, Verdict
@@ -72,7 +72,7 @@ class FrameInWork:
 
 @dataclass(frozen=True)
 class Task:
-    """Work of another thread, the stage that waits for it, and what to do with its ``result``."""
+    """Work of another thread, the stage that waits for it, and what to do with its ``result`` where there is one."""
 
     stage: str
     result: Future[Any]
@@ -112,7 +112,7 @@ class Observer:
         self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
         self.drive = Drive()  # the measurements so far
         self._gate = ImageGate()
-        self._odometry = VisualOdometry(config.visual_odometry, intrinsics, seed)
+        self._odometry = VisualOdometry(intrinsics, seed)
         self._keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
         )
@@ -152,7 +152,10 @@ class Observer:
         if index % 200 == 0:  # 24 MB
             return_freed_memory()
         if isinstance(frame, SequenceError):
-            self._require_readable(frame)
+            is_missing = isinstance(frame, MissingFrameError) and self._config.gaps.enabled  # never ends a run
+            self._unread += not is_missing
+            if not (is_missing or self._is_gap(self._unread)):
+                raise frame
             self._leave_out(index, str(frame))
             return
         self._unread = 0
@@ -190,14 +193,6 @@ class Observer:
     def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:
         """As `KeyframeTracking.step`, of a finished frame."""
         return self._keyframes.step(index)
-
-    def _require_readable(self, error: SequenceError) -> None:
-        """Raise after too many unreadable images in a row; missing ones are always accepted."""
-        if isinstance(error, MissingFrameError) and self._config.gaps.enabled:
-            return
-        self._unread += 1
-        if not self._is_gap(self._unread):
-            raise error
 
     def _is_gap(self, frames: int) -> bool:
         """Whether so many frames in a row may be without a measurement."""
@@ -295,9 +290,13 @@ class Observer:
         if current.snippet is not None:
             self._tasks.append(Task("pose network", current.snippet, self._keep_snippet))
         if rotation is not None:
-            self._tasks.append(Task("geometry", self._beside.submit(rotation), self._keep_rotation))
+            keep_rotation = self.drive.relative_rotations.append
+            self._tasks.append(Task("geometry", self._beside.submit(rotation), keep_rotation))
         if step is not None and previous is not None and self._config.road.enabled:
-            self._tasks.append(self._road_task(previous.frame, current, step))
+            T_previous_current = step.relative_pose.T_from_to
+            images = previous.frame, current.frame
+            measured = self._beside.submit(self._road.measure, *images, T_previous_current, current.standing)
+            self._tasks.append(Task("road", measured, partial(self._keep_road, step.ends)))
         if current.prediction is not None:
             self._tasks.append(Task("depth network", current.prediction, partial(self._learn, current)))
         if was_asked:  # that of a keyframe comes while it is adjusted
@@ -369,18 +368,11 @@ class Observer:
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
         return self._odometry.relative_rotation(first.frame, current, self._depth_of(first), T_first_current)
 
-    def _road_task(self, previous: Frame, current: FrameInWork, motion: Motion) -> Task:
-        def keep(step: RoadStep | MeasurementFailure) -> None:
-            if isinstance(step, RoadStep):
-                self.drive.road_steps[motion.ends] = step
-            else:
-                logger.info("road %d -> %d failed: %s", *motion.ends, step.reason)
-
-        T_previous_current = motion.relative_pose.T_from_to
-        measured = self._beside.submit(
-            self._road.measure, previous, current.frame, T_previous_current, current.standing
-        )
-        return Task("road", measured, keep)
+    def _keep_road(self, ends: Ends, step: RoadStep | MeasurementFailure) -> None:
+        if isinstance(step, RoadStep):
+            self.drive.road_steps[ends] = step
+        else:
+            logger.info("road %d -> %d failed: %s", *ends, step.reason)
 
     def _keep_snippet(self, snippet: SnippetPoses) -> None:
         if is_se3(snippet.T_source_target):
@@ -388,15 +380,10 @@ class Observer:
         else:
             logger.warning("the pose network around frame %d: %s", snippet.target, _NO_POSE)
 
-    def _keep_rotation(self, rotation: Any) -> None:
-        if rotation is not None:
-            self.drive.relative_rotations.append(rotation)
-
     def _keep_for_map(self, frame: Frame, depth: DepthMap) -> None:
         """Keep a thinned frame for the map."""
-        mapping = self._config.mapping
-        if mapping.enabled and frame.index % mapping.frame_stride == 0:
-            keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
+        if self._config.mapping.enabled:
+            keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file)
             self._tasks.append(Task("map", keyframe, self.drive.keyframes.append))
 
     def _finish_tasks(self, stage: str | None = None) -> None:
@@ -406,7 +393,8 @@ class Observer:
         for task in tasks:
             with self._stopwatch.stage(task.stage):
                 result = task.result.result()
-            task.keep(result)
+            if result is not None:
+                task.keep(result)
 
 
 def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:

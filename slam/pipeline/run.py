@@ -69,11 +69,8 @@ class Recorder:
     def keyframe(self, keyframe: KeyframeDepth) -> None:
         """The depth of each keyframe that is fused."""
 
-    def map(self, estimate: Estimate) -> None:
-        """The same with its map, which is None where mapping is switched off, or no frame has depth."""
-
-    def no_map(self, reason: str) -> None:
-        """An error cost the map."""
+    def map(self, estimate: Estimate | Failed) -> None:
+        """The estimate with its map, None where mapping is switched off or no frame has depth; or what cost the map."""
 
 
 class SlamPipeline:
@@ -101,6 +98,7 @@ class SlamPipeline:
         self.sequence, self._predictor, self._config = sequence, predictor, config
         self._progress, self._seed, self._gps_track = progress, seed, gps_track
         self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
+        self._positioning: Positioning | None = None  # the GPS track matched to the drive
         self._watch = Stopwatch()
         self._is_interrupted = False
 
@@ -133,10 +131,10 @@ class SlamPipeline:
         self._progress("loops and graph", 1, 1)
         recorder.estimate(estimate)
         mapped = attempt("the map", lambda: self._mapped(estimate, recorder))
-        if isinstance(mapped, Estimate):
-            return mapped
-        recorder.no_map(mapped.reason)
-        return estimate
+        if isinstance(mapped, Failed):
+            recorder.map(mapped)
+            return estimate
+        return mapped
 
     def solve(self, observed: Observations, recorder: Recorder) -> Estimate:
         """Lengths, factors and loops of a drive, and the trajectory that fits them.
@@ -164,7 +162,8 @@ class SlamPipeline:
         with self._watch.stage("loops"):
             closed = attempt("loop closure", lambda: self._closed(odometry, observed))
         odometry, loops = (odometry, LoopClosures(not_sought=closed.reason)) if isinstance(closed, Failed) else closed
-        location = self._located(odometry)
+        gps = self._positioning
+        location = None if gps is None else gps.locate(odometry.T_world_camera, odometry.scale.estimate)
         solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
         if isinstance(solved, Failed):
             solved = solved, odometry.T_world_camera, LoopClosures(not_sought=solved.reason), location
@@ -203,10 +202,11 @@ class SlamPipeline:
         return Observer(self._predictor, self.sequence.intrinsics, *parts)
 
     def require_possible(self) -> None:
-        """Check that this run can succeed; raises as `checks.require_possible` and `Positioning`."""
+        """Check that this run can succeed, and match its GPS track; as `checks.require_possible` and `Positioning`."""
         shortest = self._predictor.sources + 1
         require_possible(self.sequence, self._config, shortest, self._gps_track is not None)
-        _ = self._positioning
+        if self._gps_track is not None:
+            self._positioning = Positioning(self._gps_track, self.sequence.stamps, self._config.gps, self.mode)
         _ = self._decide
 
     def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Observations:
@@ -234,7 +234,7 @@ class SlamPipeline:
             raise SlamError(f"interrupted after {seen} frames, before the first snippet of the networks")
         logger.warning("interrupted: the run is of the first %d of %d frames", seen, total)
         self.sequence = first_frames(self.sequence, seen)
-        self.__dict__.pop("_positioning", None)
+        self.require_possible()
 
     def _completed(self, observed: Observations, closure: MapClosure) -> Drive:
         """The drive with its gaps interpolated and the poses of its maps."""
@@ -276,12 +276,6 @@ class SlamPipeline:
             drive = self._completed(observed, closure)
             odometry = self._odometry(drive, odometry.scale, odometry.lidar_steps, odometry.agreements)
         return odometry, closure.closures(odometry.scale)
-
-    def _located(self, odometry: Odometry) -> Location | MeasurementFailure | None:
-        """Where the odometry lies on the earth; None without a GPS track."""
-        if self._positioning is None:
-            return None
-        return self._positioning.locate(odometry.T_world_camera, odometry.scale.estimate)
 
     def _optimised(
         self, odometry: Odometry, loops: LoopClosures, location: Location | MeasurementFailure | None
@@ -346,12 +340,6 @@ class SlamPipeline:
     def _decide(self) -> Decide | None:
         """Between learned and measured depth of the map's keyframes."""
         return decision(self._config.depth) if self._config.mapping.enabled else None
-
-    @cached_property
-    def _positioning(self) -> Positioning | None:
-        """The GPS track matched to the drive, None without one."""
-        track = self._gps_track
-        return None if track is None else Positioning(track, self.sequence.stamps, self._config.gps, self.mode)
 
     @property
     def _reference(self) -> Trajectory | None:

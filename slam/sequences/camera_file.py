@@ -67,9 +67,10 @@ def find_camera_file(
     if camera is not None:
         return camera
     places = " and ".join(dict.fromkeys(str(folder) for folder in folders))
+    looked = f"looked in {places}; put one there or " if places else ""
     raise SequenceError(
-        f"no {CAMERA_FILE} for {wanted_by}: looked in {places}; put one there or give it with --camera "
-        f"(width, height, fx, fy, cx, cy, fps), or give the horizontal field of view in degrees, --camera fov=70"
+        f"no {CAMERA_FILE} for {wanted_by}: {looked}give it with --camera (width, height, fx, fy, cx, cy, fps), or "
+        "give the horizontal field of view in degrees, --camera fov=70"
     )
 
 

@@ -43,10 +43,10 @@ def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_p
     images, poses = data_root / "handheld_kitchen" / "images", data_root / "handheld_kitchen" / "poses.kitti.txt"
     overrides = [*TRAJECTORY_ALONE, "scale.mode=reference"]
     run = run_slam(images, frames="0:300", truth=poses, output=tmp_path / "run", device="cpu", overrides=overrides)
-    numbers = range(322, 342, 2)  # 0.2 to 0.4 m from the nearest view
+    frames = slice(322, 342, 2)  # 0.2 to 0.4 m from the nearest view
     known = read_trajectory(poses).T_world_camera
-    T_world_image = invert(known[0]) @ known[numbers.start : numbers.stop : numbers.step]
-    found = [each.T_world_camera for each in localise(images, run, numbers=numbers)]
+    T_world_image = invert(known[0]) @ known[frames]
+    found = [each.T_world_camera for each in localise(images, run, frames="322:342", every=2)]
     errors_m = [np.inf if T is None else np.linalg.norm((T - true)[:3, 3]) for T, true in zip(found, T_world_image)]
     assert sum(error_m < 0.15 for error_m in errors_m) >= 9
     street = data_root / "street_depth" / "images"

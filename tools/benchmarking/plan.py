@@ -53,13 +53,8 @@ _PARTS: dict[str, tuple[str, ...]] = {
 ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _PARTS.items()))
 _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "depth not refined": ("depth.refine=none",),
-    "no border": ("mapping.border=0",),
-    "no sky": ("mapping.sky_brightness=256", "mapping.sky_blueness=256"),
-    "range to 20 m, however sure": ("mapping.certain_range_factor=1",),
-    "range to 30 m": ("mapping.depth_max_m=30", "mapping.certain_range_factor=1"),
-    "no edge": ("mapping.max_depth_step=100",),
-    "no agreement": ("mapping.max_depth_difference=100",),
-    "small pieces kept": ("mapping.min_component_triangles=0",),
+    "range to 30 m": ("mapping.depth_max_m=30",),
+    "holes left open": ("mapping.close_holes_m=0",),
     "no loops": ("loops.enabled=false",),
 }
 MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _MAP_PARTS.items()))

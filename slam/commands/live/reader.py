@@ -6,16 +6,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Condition, Event, Thread
 
 import numpy as np
 
-from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.camera_file import CameraFile
 from slam.commands.live.source import Source
 from slam.frames import Frame, Image
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.recording import GrowingSequence
 from slam.sequences.undistortion import Undistortion, intrinsics_of
 
@@ -45,7 +43,7 @@ class Reader:
     def __init__(
         self, source: Source, most_wait_s: float, prepare: Callable[[Image], Image], every_frame: bool = False
     ) -> None:
-        """Start to read.
+        """Prepare to read; the thread begins with the iteration.
 
         Args:
             source: is read until it ends, dies, or sends nothing for ``most_wait_s``.
@@ -60,9 +58,9 @@ class Reader:
         self._reason: str | None = None
         self._changed, self._stopped = Condition(), Event()
         self._thread = Thread(target=self._read, name="reader", daemon=True)
-        self._thread.start()
 
     def __iter__(self) -> Iterator[Arrival]:
+        self._thread.start()
         while (arrival := self._take()) is not None:
             yield Arrival(arrival.stamp, self._prepare(arrival.image), arrival.at_s)
 
@@ -79,7 +77,8 @@ class Reader:
     def close(self) -> None:
         """Stop, and wait for the thread: one that still decodes an image when the process ends would abort it."""
         self.stop()
-        self._thread.join(_LAST_IMAGE_S)
+        if self._thread.is_alive():
+            self._thread.join(_LAST_IMAGE_S)
 
     def _take(self) -> Arrival | None:
         with self._changed:
@@ -120,7 +119,7 @@ class StreamedSequence(GrowingSequence):
     def __init__(
         self, name: str, source: Source, camera: CameraFile, most_wait_s: float, every_frame: bool = False
     ) -> None:
-        """Begin to read.
+        """Prepare to read.
 
         Raises:
             SequenceError: every frame is wanted of a source that does not wait.
@@ -146,20 +145,3 @@ class StreamedSequence(GrowingSequence):
             self.arrivals = {k: v for k, v in self.arrivals.items() if k >= index - 2} | {index: arrival}
             arrival.image.setflags(write=False)
             yield Frame(index, arrival.stamp, arrival.image)
-
-
-def calibration_of(camera: str, given: Path | None, source: Source) -> CameraFile:
-    """The calibration given, or the ``camera.yaml`` beside a folder or a video.
-
-    Raises:
-        SequenceError: there is none.
-    """
-    if given is not None:
-        return explicit_camera(given, source, source.fps)
-    path = Path(camera)
-    places = (path, path.absolute().parent) if path.is_dir() else (path.absolute().parent,) if path.is_file() else ()
-    found = beside(*places)
-    if found is None:
-        looked = f"; no {CAMERA_FILE} is in {' or '.join(map(str, places))}" if places else ""
-        raise SequenceError(f"{camera} needs its calibration: give --camera {CAMERA_FILE} or fov=70{looked}")
-    return found

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import Any, Literal, TextIO
+from typing import Any
 
 import numpy as np
 
 from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import raising_on_termination
-from slam.commands.live.reader import EXPECTED, StreamedSequence, calibration_of
+from slam.commands.live.reader import EXPECTED, StreamedSequence
 from slam.commands.live.source import open_source
 from slam.commands.run.recorder import FolderRecorder
-from slam.commands.run.request import RunRequest
+from slam.commands.run.request import Request
 from slam.commands.run.run import provenance_of, record
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
@@ -27,7 +25,6 @@ from slam.frames import Intrinsics
 from slam.frontend.drive import Drive
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.pipeline.checks import require_possible
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.observer import Observer
@@ -38,9 +35,7 @@ from slam.results.output import check_output
 from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
-from slam.sequences.camera_file import as_known
-from slam.sequences.recording import GrowingSequence
-from slam.sequences.undistortion import intrinsics_of
+from slam.sequences.camera_file import as_known, find_camera_file
 
 logger = logging.getLogger(__name__)
 
@@ -50,22 +45,13 @@ _PATH = (40, 110, 240)
 _DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"
 
 
-@dataclass(frozen=True)
-class LiveRequest:
-    """All inputs of a live run, as ``erfsfm-slam live --help`` says; ``command`` is recorded in the metrics."""
+class LiveRequest(Request):
+    """All inputs of a live run, as ``erfsfm-slam live --help`` says."""
 
     dataset: str
-    camera: Path | None = None
     every_frame: bool = False
-    output: Path | None = None
     view: bool = False
     wait: float = 10.0
-    weights: str = "default"
-    config: str | None = None
-    overrides: list[str] | None = None
-    seed: int = 0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    command: str = "slam.commands.live.run.run_live"
 
 
 def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
@@ -87,33 +73,24 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
         source = open_source(request.dataset, request.wait)
-        camera = calibration_of(request.dataset, request.camera, source)
-        source.fps, intrinsics, name = camera.fps, intrinsics_of(camera), Path(request.dataset).stem or "live"
-        prediction = open_prediction(request.weights, request.device, settings.depth, intrinsics)
-        networks = prediction.networks
-        growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
-        require_possible(growing, settings, networks.sources + 1)
-        blank = np.zeros((intrinsics.height, intrinsics.width, 3), np.uint8)
-        networks.depth(blank)  # both are loaded before images come
-        networks.poses([blank] * (networks.sources + 1))
-        viewer = Viewer(intrinsics) if request.view else None
+        path = Path(request.dataset).absolute()
+        folders = (path, path.parent) if path.exists() else ()
+        camera = find_camera_file(request.camera, *folders, wanted_by=request.dataset, images=source, fps=source.fps)
+        source.fps, name = camera.fps, Path(request.dataset).stem or "live"
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
         sequence.intrinsics = as_known(sequence.intrinsics, request.camera)
-        reader = sequence.reader
+        prediction = open_prediction(request.weights, request.device, settings.depth, sequence.intrinsics)
+        pipeline = SlamPipeline(sequence, prediction.predictor, settings, seed=request.seed)
+        pipeline.require_possible()
+        blank = np.zeros((sequence.intrinsics.height, sequence.intrinsics.width, 3), np.uint8)
+        prediction.networks.depth(blank)  # both are loaded before images come
+        prediction.networks.poses([blank] * (prediction.networks.sources + 1))
+        viewer = Viewer(sequence.intrinsics) if request.view else None
+        folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
+        recorder = LiveRecorder(folder, pipeline, settings, provenance_of(request, prediction, sequence))
+        poses, reader = LivePoses(prediction.networks.sources, sequence.camera_height_m, settings), sequence.reader
+        recorder.follow(sequence, poses, emit, viewer)
         try:
-            pipeline = SlamPipeline(sequence, prediction.predictor, settings, seed=request.seed)
-            folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
-            recorded = RunRequest(
-                Path(request.dataset),
-                camera=request.camera,
-                weights=request.weights,
-                seed=request.seed,
-                command=request.command,
-            )
-            provenance = provenance_of(recorded, prediction, sequence)
-            poses = LivePoses(networks.sources, sequence.camera_height_m, settings)
-            recorder = LiveRecorder(folder, pipeline, settings, provenance)
-            recorder.follow(sequence, poses, emit, viewer)
             # in a thread: the reader's lock may be held by the code that is interrupted
             record(recorder, log, ignore_signals, sequence.frames(), lambda: Thread(target=reader.stop).start())
         except SlamError as error:
@@ -229,9 +206,3 @@ def corrected_message(trajectory: Trajectory, loops: int, unit: str | None, run:
     stamps = [float(stamp) for stamp in trajectory.stamps]
     content = {"type": "trajectory", "state": state, "loops": loops, "unit": unit, "run": run}
     return content | {"stamps": stamps, "T_world_camera": poses}
-
-
-def write_line(stream: TextIO, message: dict[str, Any]) -> None:
-    """Write a message as a line of JSON."""
-    stream.write(json.dumps(message) + "\n")
-    stream.flush()

@@ -23,7 +23,7 @@ from erfsfm.common.readers.images import (
     stretch_of,
 )
 from slam.frames import Image
-from slam.runtime.errors import SequenceError, sequence_errors
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import DEFAULT_FPS
 
 _DESCRIBED_STREAMS = (".sdp", ".m3u8")
@@ -60,7 +60,13 @@ class FolderSource:
         self._folder, self.fps = folder, DEFAULT_FPS
         self._past: set[str] = set()
         self._stretch: Stretch | None = None
-        self.height, self.width = self._first_size(wait_s)
+        deadline = time.monotonic() + wait_s
+        while (size := self._first_size()) is None:
+            if time.monotonic() > deadline:
+                suffixes = ", ".join(IMAGE_SUFFIXES)
+                raise SequenceError(f"no image came to {folder} within {wait_s:g} s: looked for {suffixes}")
+            time.sleep(_POLL_S)
+        self.height, self.width = size
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
         """Every usable image, in natural order; one that comes after its successor is left out with a warning."""
@@ -82,12 +88,21 @@ class FolderSource:
                 time.sleep(_POLL_S)
 
     def _usable(self, path: Path) -> Image | None:
-        """An image of the size of the first once it is whole; others are named in a warning."""
-        try:
-            image = self._read(path, time.monotonic() + _WRITING_S)
-        except SequenceError as error:
-            logger.warning("%s; it is left out", error)
-            return None
+        """An image of the size of the first; others are named in a warning.
+
+        One that is still being written is read again for a second, or until the next one is there.
+        """
+        deadline, is_written = time.monotonic() + _WRITING_S, False
+        while True:
+            try:
+                image = read_image(path, self._stretch)
+                break
+            except DataError as error:
+                if time.monotonic() > deadline or is_written:
+                    logger.warning("%s; it is left out", error)
+                    return None
+                is_written = self._waiting()[-1:] != [path]
+                time.sleep(_POLL_S)
         height, width = image.shape[:2]
         if (height, width) == (self.height, self.width):
             return image
@@ -102,37 +117,15 @@ class FolderSource:
             raise SequenceError(f"{self._folder} cannot be read any more: {error.strerror or error}") from error
         return sorted(filter(is_image, fresh), key=natural_key)
 
-    @sequence_errors()
-    def _first_size(self, wait_s: float) -> tuple[int, int]:
-        deadline = time.monotonic() + wait_s
-        while True:
-            is_late = time.monotonic() >= deadline
-            try:
-                if waiting := self._waiting():
-                    size = first_size(waiting)
-                    self._stretch = stretch_of(waiting)
-                    return size
-            except DataError:
-                if is_late:
-                    raise
-            if is_late:
-                break
-            time.sleep(_POLL_S)
-        suffixes = ", ".join(IMAGE_SUFFIXES)
-        raise SequenceError(f"no image came to {self._folder} within {wait_s:g} s: looked for {suffixes}")
-
-    @sequence_errors()
-    def _read(self, path: Path, deadline: float) -> Image:
-        """An image; one that is still being written is read again until ``deadline`` or until the next one is there."""
-        is_written = False
-        while True:
-            try:
-                return read_image(path, self._stretch)
-            except DataError:
-                if time.monotonic() > deadline or is_written:
-                    raise
-                is_written = self._waiting()[-1:] != [path]
-                time.sleep(_POLL_S)
+    def _first_size(self) -> tuple[int, int] | None:
+        """Height and width of the first image that can be read; None while there is none."""
+        try:
+            if waiting := self._waiting():
+                self._stretch = stretch_of(waiting)
+                return first_size(waiting)
+        except DataError:
+            pass  # it is still being written
+        return None
 
 
 class VideoSource:

@@ -14,6 +14,7 @@ from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image
 from slam.mapping.filters import KeyframeDepth
+from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.results.depth import DepthQuality
@@ -88,19 +89,13 @@ class FolderRecorder(Recorder):
         with self._stopwatch.stage("evaluation"):
             self._quality.add(keyframe)
 
-    def map(self, estimate: Estimate) -> None:
-        """Merge the submaps, write mesh and cloud; an empty map gives a reason."""
-        if estimate.map is None:
-            enabled = self._settings.mapping.enabled
-            self.no_map(_NO_KEYFRAMES if enabled else "fusion is switched off (mapping.enabled)")
+    def map(self, estimate: Estimate | Failed) -> None:
+        """Merge the submaps, write mesh and cloud; without a map its metrics are the reason."""
+        surface = self._surface(estimate)
+        if isinstance(surface, Failed):
+            self._metrics = self._metrics.changed(map=MapMetrics.unknown(surface.reason, *SIZES, *MAP_ERRORS))
             return
-        try:
-            with self._stopwatch.stage("mesh"):
-                surface = estimate.map.surface(self._progress)
-        except EmptyMapError as error:
-            logger.warning("no map: %s", error)
-            self.no_map(str(error))
-            return
+        assert isinstance(estimate, Estimate) and estimate.map is not None
         self._progress("map files", 0, 1)
         with self._stopwatch.stage("mesh"):
             surface.write_mesh(self.folder.path / MAP_MESH)
@@ -115,9 +110,19 @@ class FolderRecorder(Recorder):
         found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
         self._metrics = self._metrics.changed(map=found)
 
-    def no_map(self, reason: str) -> None:
-        """The reason is its metric."""
-        self._metrics = self._metrics.changed(map=MapMetrics.unknown(reason, *SIZES, *MAP_ERRORS))
+    def _surface(self, estimate: Estimate | Failed) -> MapSurface | Failed:
+        """The surface of the map, or why there is none."""
+        if isinstance(estimate, Failed):
+            return estimate
+        if estimate.map is None:
+            is_enabled = self._settings.mapping.enabled
+            return Failed(_NO_KEYFRAMES if is_enabled else "fusion is switched off (mapping.enabled)")
+        try:
+            with self._stopwatch.stage("mesh"):
+                return estimate.map.surface(self._progress)
+        except EmptyMapError as error:
+            logger.warning("no map: %s", error)
+            return Failed(str(error))
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""

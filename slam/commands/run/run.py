@@ -5,18 +5,17 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from erfsfm import __version__
 from erfsfm.common.files import FolderLock
-from erfsfm.common.progress import progress_bar, progress_lines, silent
+from erfsfm.common.progress import progress_bar, progress_lines
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.common.threads import limit_library_threads
 from erfsfm.inference import commit
 from slam.commands.run.recorder import FolderRecorder
-from slam.commands.run.request import RunRequest
+from slam.commands.run.request import Request, RunRequest
 from slam.config.sections import load_config
 from slam.frames import Frame
 from slam.frames import Sequence as FrameSequence
@@ -56,12 +55,11 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
         TypeError: an unknown argument.
         SlamError, ErfsfmError: as `perform`.
     """
-    request = RunRequest.of(dataset=dataset, sequence=sequence, **options)
-    if request.progress is not None:
-        return perform(request)
+    if options.get("progress") is not None:
+        return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options))
     in_notebook = "ipykernel" in sys.modules
     with progress_bar() if in_notebook else progress_lines(logger.info) as progress:
-        return perform(replace(request, progress=progress))
+        return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options | {"progress": progress}))
 
 
 def perform(request: RunRequest) -> RunFolder:
@@ -85,7 +83,7 @@ def perform(request: RunRequest) -> RunFolder:
         undistort = None if lens is None else lens.apply_to_depth
         prediction = open_prediction(request.weights, request.device, settings.depth, camera, numbers, undistort)
         track = None if request.gps is None else read_gps(request.gps)
-        progress = request.progress or silent
+        progress = request.progress
         pipeline = SlamPipeline(recording, prediction.predictor, settings, progress, request.seed, track)
         pipeline.require_possible()
         folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
@@ -123,7 +121,7 @@ def record(
         raise
 
 
-def provenance_of(request: RunRequest, prediction: Prediction, recording: FrameSequence) -> Provenance:
+def provenance_of(request: Request, prediction: Prediction, recording: FrameSequence) -> Provenance:
     """The input of a run: networks, depth, and the options that name the recording."""
     networks, source = prediction.networks, prediction.source
     is_folder = Path(request.weights) == Path(networks.origin)  # else a shipped name, whatever lies here

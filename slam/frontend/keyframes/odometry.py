@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.keyframes.first_motion import first_motion
 from slam.frontend.keyframes.image_turn import (
@@ -47,6 +46,7 @@ _LAST_FRAMES = 4  # frames in which a pose is looked up
 _PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
 _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
+MAX_CORNERS = 500  # of a keyframe
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -55,7 +55,6 @@ class KeyframeOdometry:
 
     def __init__(
         self,
-        config: KeyframesConfig,
         intrinsics: Intrinsics,
         seed: int = 0,
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
@@ -64,7 +63,6 @@ class KeyframeOdometry:
 
         ``on_keyframe`` is told of a keyframe before it is adjusted, so that its depth is predicted meanwhile.
         """
-        self._config = config
         self._intrinsics = intrinsics
         self._seed = seed
         self._on_keyframe = on_keyframe
@@ -277,13 +275,13 @@ class KeyframeOdometry:
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""
         self._on_keyframe(frame)
-        config, intrinsics, local = self._config, self._intrinsics, segment.map
+        intrinsics, local = self._intrinsics, segment.map
         T, is_tracked = self._T_camera_world, len(track_ids) > 0
         if is_tracked:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
             again, reprojected = local.found_again(frame.grey, T, track_ids, intrinsics)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
-        fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels))
+        fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels))
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import (
     DepthMap,
     Ends,
@@ -57,6 +56,7 @@ from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
 
 logger = logging.getLogger(__name__)
+MIN_INLIERS = 20  # of a measurement: each satisfies both constraints
 ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
@@ -102,20 +102,14 @@ class OdometryState:
 class VisualOdometry:
     """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth."""
 
-    def __init__(
-        self,
-        config: VisualOdometryConfig,
-        intrinsics: Intrinsics,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Prepare for the first frames; ``seed`` is that of RANSAC."""
-        self._config = config
         self._working = WorkingSize(intrinsics)
         self._intrinsics = intrinsics = self._working.camera
         self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
-        self._tracker = CornerTracker(config)
-        self._two_views = TwoViewEstimator(config, intrinsics.fx, seed)
+        self._tracker = CornerTracker()
+        self._two_views = TwoViewEstimator(intrinsics.fx, seed)
         self._state = OdometryState(
             DynamicMask.empty(intrinsics.width, intrinsics.height, _MASK_SHARPNESS),
             MotionHistory(),
@@ -149,7 +143,7 @@ class VisualOdometry:
         depth_previous_unscaled = self._working.depth(depth_previous_unscaled)
         flow = self._predicted_flow(previous, current, depth_previous_unscaled)
         tracks = self._tracker.track(previous, current, flow, standing)
-        if len(tracks) < self._config.min_inliers:
+        if len(tracks) < MIN_INLIERS:
             measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
         else:
             learned = nearest_depth(depth_previous_unscaled, tracks.previous)
@@ -199,12 +193,12 @@ class VisualOdometry:
 
         def measure() -> RelativeRotation | None:
             tracks = find()
-            if len(tracks) < self._config.min_inliers:
+            if len(tracks) < MIN_INLIERS:
                 return None
             votes, learned = np.ones(len(tracks), dtype=bool), nearest_depth(depth_first_unscaled, tracks.previous)
             matches = self._matches(tracks, votes, learned, None, mask, error)
             estimate = self._two_views.refined(matches, known[0])
-            if estimate is None or estimate.inliers.sum() < self._config.min_inliers:
+            if estimate is None or estimate.inliers.sum() < MIN_INLIERS:
                 return None
             sigmas = np.sqrt(np.diag(estimate.covariance)[:3])
             return RelativeRotation(first.index, last.index, estimate.unit_pose.R_current_previous, sigmas)
@@ -224,7 +218,7 @@ class VisualOdometry:
     def _votes(self, tracks: Tracks) -> NDArray[np.bool_]:
         """Which tracks ``(M,)`` have the vote: all, where few are left that fitted the last motion."""
         fitted = np.isin(tracks.track_ids, self._state.fitted)
-        return fitted if fitted.sum() >= self._config.min_inliers else np.ones(len(tracks), dtype=bool)
+        return fitted if fitted.sum() >= MIN_INLIERS else np.ones(len(tracks), dtype=bool)
 
     def _matches(
         self,
@@ -275,7 +269,7 @@ class VisualOdometry:
 
         def step(corners: Matches, before: MotionHistory) -> Step | None:
             two_view = self._two_views.estimate(corners, before)
-            if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
+            if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
             return self._triangulated(ends, seconds, tracks, corners, trusted_depth(learned, height), two_view)
 
@@ -356,14 +350,14 @@ class VisualOdometry:
     ) -> Motion | MeasurementFailure:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth) & votes
-        if known.sum() < self._config.min_inliers:
+        if known.sum() < MIN_INLIERS:
             return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
         corrected = self._state.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
         start = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
         count = 0 if start is None else len(start[1])
-        if start is None or count < max(self._config.min_inliers, _LEAST_PNP_SHARE * len(pixels)):
+        if start is None or count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
             return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
         T_start, inliers = start

@@ -15,7 +15,6 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
 from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
@@ -97,8 +96,7 @@ class TwoViewEstimate:
 class TwoViewEstimator:
     """Estimates the motions of one drive; stateless, the history is an argument."""
 
-    def __init__(self, config: VisualOdometryConfig, focal_px: float, seed: int = 0) -> None:
-        self._config = config
+    def __init__(self, focal_px: float, seed: int = 0) -> None:
         self._focal_px = focal_px
         self._seed = seed
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import subprocess
@@ -20,12 +19,12 @@ import pytest
 import slam
 import slam.commands.run.run
 from slam.commands.cli import main
-from slam.commands.run.request import LARGEST_SEED, RunRequest
+from slam.commands.run.request import RunRequest
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import read_trajectory
 from slam.results.folder import RunFolder
-from slam.runtime.errors import RunError, SlamError
+from slam.runtime.errors import RunError
 
 Call = Callable[..., tuple[int, str, str]]
 MakeRun = Callable[..., RunFolder]
@@ -66,73 +65,16 @@ def test_help_of_every_verb_is_light() -> None:
     assert set(finished.stdout.split()) >= VERBS
 
 
-@pytest.mark.parametrize(("typed", "wanted"), [("erfsfm-slam ev", "evaluate"), ("erfsfm-slam run --wei", "--weights")])
-def test_shells_complete(typed: str, wanted: str) -> None:
-    words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
-    finished = subprocess.run(
-        [sys.executable, "-m", "slam"],
-        env=os.environ | words | {"_ERFSFM_SLAM_COMPLETE": "complete_bash"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert finished.stdout.split() == [wanted], finished.stderr
-
-
-def in_shell(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        f"{shlex.quote(sys.executable)} -m slam {arguments}",
-        shell=True,
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(Path(slam.__file__).parents[1])},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "end"),
-    [
-        *(("config", "| true"), ("config", ">&-")),
-        *(("evaluate --help", "| true"), ("evaluate estimate.txt estimate.txt", ">&-")),
-    ],
-)
-def test_a_closed_stdout_is_no_traceback(tmp_path: Path, arguments: str, end: str) -> None:
-    (tmp_path / "estimate.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
-    finished = in_shell(f"{arguments} {end}", tmp_path)
-    assert finished.stderr == "" and finished.stdout == ""
-
-
-def test_a_closed_stderr_stops_nothing(tmp_path: Path) -> None:
-    finished = in_shell("simulate world --route straight --frames 5 --width 104 --height 32 2>&-", tmp_path)
-    assert finished.returncode == 0 and "5 frames in world" in finished.stdout
-
-
-def test_an_error_of_several_lines_is_printed_as_one(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any) -> None:
-        raise SlamError("first line\nsecond line")
-
-    monkeypatch.setattr(slam.commands.run.run, "perform", fail)
-    assert call("run") == (1, "", "erfsfm-slam: first line second line\n")
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
         [],
         ["fly"],
-        ["run", "--sped", "3"],
         ["run", "--seed", "-1"],
-        ["run", "--device", "tpu"],
-        ["evaluate"],
         ["evaluate", "one.txt"],
         ["evaluate", "a.txt", "b.txt", "c.txt"],
-        ["evaluate", "a.txt", "b.txt", "--format", "euroc"],
         ["evaluate", ".", "--fail-over", "ate_rmse_m=1"],
         ["evaluate", ".", "--csv", "a.csv"],
-        ["export", "."],
-        ["simulate", "world", "--frames", "many"],
     ],
 )
 def test_wrong_usage_exits_with_2(call: Call, arguments: list[str]) -> None:
@@ -312,19 +254,6 @@ def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run:
         assert call(*words, "--seed", 3, "--device", "cpu")[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("what", "output", "start"),
-    [
-        ("mesh", "a/map.ply", "ply"),
-        ("cloud", "map.ply", "ply"),
-    ],
-)
-def test_export(call: Call, make_run: MakeRun, what: str, output: str, start: str) -> None:
-    run = make_run()
-    code, out, _ = call("export", run.path, "--what", what, "--output", output)
-    assert code == 0 and output in out and Path(output).read_bytes().startswith(start.encode())
-
-
 def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
     run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
     assert call(*run)[0] == 0
@@ -371,7 +300,7 @@ def test_a_request_names_its_recording(tmp_path: Path) -> None:
     assert given.recording.tree() == {"dataset": str(tmp_path), "camera": "fov=70", "frames": "0:9"}
 
 
-@pytest.mark.parametrize("seed", [-1, LARGEST_SEED + 1, "many"])
+@pytest.mark.parametrize("seed", [-1, 2**31, "many"])
 def test_a_seed_from_python_is_checked(seed: object) -> None:
     with pytest.raises(RunError, match="run_slam: seed: "):
         RunRequest.of(seed=seed)

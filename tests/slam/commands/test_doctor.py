@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
-from safetensors.numpy import load_file, save_file
 
 from slam.commands import doctor
 from slam.commands.doctor import examine
@@ -51,64 +48,11 @@ def test_weights_are_named_with_their_licence(monkeypatch: pytest.MonkeyPatch, t
     assert line.startswith("ok") and "depthnet and posenet" in line and "none, untrained" in line
 
 
-def cut(file: Path) -> None:
-    file.write_bytes(file.read_bytes()[:-9])
-
-
-def diverged(file: Path) -> None:
-    tensors = load_file(file)
-    save_file({key: tensor * np.nan for key, tensor in tensors.items()}, file)
-
-
-@pytest.mark.parametrize(
-    ("damage", "reason"), [(Path.unlink, "missing or damaged"), (cut, "missing or damaged"), (diverged, "NaN")]
-)
-def test_damaged_weights(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    tiny_weights: Path,
-    damage: Callable[[Path], None],
-    reason: str,
-) -> None:
-    folder = Path(shutil.copytree(tiny_weights, tmp_path / "weights"))
-    damage(folder / "pose.safetensors")
-    monkeypatch.setattr(doctor, "WEIGHTS", (str(folder),))
-    line = finding(examine(None), "weights")
-    assert line.startswith("missing") and "pose.safetensors" in line and reason in line
-
-
 @pytest.mark.parametrize("how", ["IMPORTED", "LOOKED_UP"])
 def test_a_missing_package_comes_with_its_installation(monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     monkeypatch.setattr(doctor, how, {"no-such-package": "no_such_package"})
     line = finding(examine(None), "no-such-package:")
     assert line.startswith("missing") and "pip install" in line
-
-
-@pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of an installed package, the only one that is looked up."""
-    record = tmp_path / "gravel-1.0.dist-info"
-    record.mkdir()
-    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: gravel\nVersion: 1.0\nRequires-Dist: numpy<3,>=2\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(doctor, "LOOKED_UP", ("gravel",))
-    return tmp_path
-
-
-def test_a_whole_package_is_ok_without_its_import(package: Path) -> None:
-    assert finding(examine(None), " gravel") == "ok       gravel 1.0"
-    assert "gravel" not in sys.modules
-
-
-def test_a_package_without_what_it_needs(package: Path) -> None:
-    with (package / "gravel-1.0.dist-info" / "METADATA").open("a") as file:
-        file.write("Requires-Dist: kerb; sys_platform == 'never'\nRequires-Dist: kerb-stones (>=2)\n")
-    line = finding(examine(None), " gravel")
-    assert line.startswith("missing") and "kerb-stones" in line
-
-
-def test_a_camera_without_a_data_set_is_said() -> None:
-    assert finding(examine(None, Path("fov=70")), "fov=70").startswith("missing")
 
 
 @pytest.mark.parametrize("by_variable", [False, True])

@@ -175,15 +175,6 @@ def test_grey_images_scans_and_sequences_without_poses(tmp_path: Path, download:
 
 
 @pytest.mark.parametrize("cut_from", [0, 4])
-def test_a_connection_that_breaks_is_taken_up_again(server: Server, download: Call, cut_from: int) -> None:
-    """In a table of contents, and in an image."""
-    server.cuts_left, server.cut_from = 2, cut_from
-    code, _, err = download(*KITTI)
-    assert code == 0, err
-    assert server.cuts_left == 0
-
-
-@pytest.mark.parametrize("cut_from", [0, 4])
 def test_one_that_keeps_breaking_is_named_and_goes_on_later(
     tmp_path: Path, server: Server, download: Call, cut_from: int
 ) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import CameraFile
-from slam.commands.localisation import Localiser, image_numbers, localisation_table, localise, write_localisations
-from slam.config.sections import LoopsConfig, dump_yaml, load_config
+from slam.commands.localisation import Localiser, localisation_table, localise, write_localisations
+from slam.config.sections import dump_yaml, load_config
 from slam.formats.trajectory import Trajectory, associate, read_trajectory, write_kitti
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
@@ -26,7 +26,6 @@ from slam.runtime.run_files import PLACES
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
-CONFIG = LoopsConfig()
 UNIT = 0.5  # lengths of the map per metre
 
 
@@ -95,7 +94,7 @@ def test_places_read_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("hazards", [(), ("rain",)])  # the album has another exposure
 def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
-    localiser = Localiser(places(), CONFIG)
+    localiser = Localiser(places())
     found = 0
     for k in range(4, 58, 6):
         result = localiser.locate(f"{k}", street(630, hazards).frame(k).image)
@@ -115,7 +114,7 @@ def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -
         replace(view, points=(view.points * rng.lognormal(0.0, 0.5, (len(view), 1))).astype(np.float32))
         for view in places().views
     )
-    localiser = Localiser(replace(places(), views=views), CONFIG)
+    localiser = Localiser(replace(places(), views=views))
     for k in (10, 25, 40):
         found = localiser.locate(f"{k}", street(630).frame(k).image).T_world_camera
         assert found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
@@ -124,12 +123,12 @@ def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -
 def test_another_size_of_the_same_camera_is_found_too() -> None:
     image = street(630).frame(31).image
     twice = np.asarray(cv2.resize(image, (624, 192), interpolation=cv2.INTER_CUBIC), np.uint8)
-    assert Localiser(places(), CONFIG).locate("twice", twice).nearest_frame in (30, 33)
-    own = Localiser(places(), CONFIG, places().intrinsics.resized(624, 192)).locate("own", twice)
+    assert Localiser(places()).locate("twice", twice).nearest_frame in (30, 33)
+    own = Localiser(places(), places().intrinsics.resized(624, 192)).locate("own", twice)
     assert own.T_world_camera is not None
     assert np.linalg.norm(own.T_world_camera[:3, 3] / UNIT - reference()[31, :3, 3]) < 0.5
     with pytest.raises(SequenceError, match="the image is 300x192, its camera 312x96: give its --camera"):
-        Localiser(places(), CONFIG).locate("cut", twice[:, :300])
+        Localiser(places()).locate("cut", twice[:, :300])
 
 
 def bent(image: Image, camera: CameraFile) -> Image:
@@ -155,7 +154,7 @@ def test_images_of_a_lens_need_its_camera_file(
     save(tmp_path / "album" / "images" / "25.png", bent(street(630).frame(25).image, lens))
     if where is None:
         with pytest.raises(SequenceError, match=r"undistorted its images, and .*album has no camera\.yaml: give its"):
-            list(localise(tmp_path / "album", run))
+            localise(tmp_path / "album", run)
         return
     (tmp_path / "album" / where / "camera.yaml").write_text(lens.model_dump_json(exclude_none=True))
     for images in given:
@@ -171,7 +170,7 @@ def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, albu
     camera.write_text(
         f"{{width: 156, height: 48, fx: 90, fy: 90, cx: 77.5, cy: 23.5, fps: 10, model: {model}, {lens}}}"
     )
-    for found in list(localise(album, run, camera))[:4]:
+    for found in localise(album, run, camera)[:4]:
         assert found.T_world_camera is None and "the image is 312x96, its camera 156x48: give" in found.reason
 
 
@@ -182,14 +181,14 @@ def test_images_of_other_places_are_refused(what: str) -> None:
         "noise": [np.random.default_rng(0).integers(0, 255, (96, 312, 3), np.uint8)],
         "black": [np.zeros((96, 312, 3), np.uint8)],
     }[what]
-    localiser = Localiser(places(), CONFIG)
+    localiser = Localiser(places())
     for image in images:
         result = localiser.locate(what, image)
         assert result.T_world_camera is None and result.nearest_frame is None and result.reason
 
 
 def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    found = list(localise(album, run))
+    found = localise(album, run)
     assert [each.image for each in found] == ["10.png", "25.png", "40.png", "50.png", "60.png"]
     assert [each.T_world_camera is not None for each in found] == [True, True, True, False, False]
     assert "60.png" in found[4].reason
@@ -206,7 +205,8 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     written = read_trajectory(tmp_path / "found.tum")
     np.testing.assert_array_equal(written.stamps, [0.0, 1.0, 2.0])
     np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
-    write_localisations(tmp_path / "found.kitti", found, [10, 25, 40, 50, 60])
+    numbered = [replace(each, number=int(Path(each.image).stem)) for each in found]
+    write_localisations(tmp_path / "found.kitti", numbered)
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(60.0), reference()))
     pair = associate(read_trajectory(tmp_path / "found.kitti"), read_trajectory(tmp_path / "truth.txt"))
     assert [len(each) for each in pair] == [3, 3]
@@ -215,13 +215,13 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
 
 def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="none of 1 images was found"):
-        write_localisations(tmp_path / "found.tum", list(localise(album / "50.png", run)))
+        write_localisations(tmp_path / "found.tum", localise(album / "50.png", run))
     assert not (tmp_path / "found.tum").exists()
 
 
 def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path) -> None:
     with pytest.raises(SequenceError, match="reaches outside"):
-        image_numbers(album, "0:6")
+        localise(album, run, frames="0:6")
     run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)
     with pytest.raises(RunError, match=r"has no places: it ran with loops\.enabled=false"):
-        list(localise(album, run))
+        localise(album, run)

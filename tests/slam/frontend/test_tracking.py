@@ -6,13 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.tracking import CornerTracker
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.geometry.epipolar import UnitRelativePose
 
-CONFIG = VisualOdometryConfig(max_corners=300)
 SHIFT_PX = 4
 
 
@@ -25,7 +23,7 @@ def frames() -> list[Frame]:
 
 
 def test_tracks_move_with_the_image_and_keep_their_ids(frames):
-    tracker = CornerTracker(CONFIG)
+    tracker = CornerTracker()
     first, second = tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])
     for tracks in (first, second):
         assert len(tracks.track_ids) == len(set(tracks.track_ids.tolist())) > 50
@@ -37,28 +35,27 @@ def test_tracks_move_with_the_image_and_keep_their_ids(frames):
 
 
 def test_new_corners_are_detected_in_what_slides_into_view(frames):
-    tracker = CornerTracker(CONFIG)
+    tracker = CornerTracker()
     for k in range(5):
         tracks = tracker.track(frames[k], frames[k + 1])
     fresh = tracks.previous[tracks.track_ids > np.median(tracks.track_ids)]
     assert len(tracks.track_ids) > 50
     assert fresh[:, 0].max() > 200 - 3 * SHIFT_PX
-    assert len(tracks.track_ids) <= CONFIG.max_corners
 
 
 def test_few_corners_are_tracked_again_with_equal_exposure(frames, monkeypatch):
     dark = Frame(1, 0.1, (0.35 * frames[1].image.astype(np.float32)).astype(np.uint8))
     monkeypatch.setattr("slam.frontend.tracking.FEW_CORNERS", 0)
-    once = CornerTracker(CONFIG).track(frames[0], dark)
+    once = CornerTracker().track(frames[0], dark)
     monkeypatch.setattr("slam.frontend.tracking.FEW_CORNERS", 1000)
-    again = CornerTracker(CONFIG).track(frames[0], dark)
+    again = CornerTracker().track(frames[0], dark)
     assert len(again.track_ids) > max(2 * len(once.track_ids), 40)
     error = np.abs(again.previous - again.current - [SHIFT_PX, 0]).max(axis=1)
     assert np.median(error) < 0.1
 
 
 def test_corners_are_tracked_across_two_frames_through_the_predicted_flow(frames):
-    tracker = CornerTracker(CONFIG)
+    tracker = CornerTracker()
     tracks = [tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])]
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
     depth, sliding = np.full((120, 200), 10.0, np.float32), UnitRelativePose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
@@ -75,4 +72,4 @@ def test_lost_corners_are_not_tracked_across(frames):
     nothing = PredictedFlow(
         UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera
     )
-    assert len(CornerTracker(CONFIG).track_across(frames[0], frames[2], nothing)().track_ids) == 0
+    assert len(CornerTracker().track_across(frames[0], frames[2], nothing)().track_ids) == 0

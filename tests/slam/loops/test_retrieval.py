@@ -3,13 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.config.sections import LoopsConfig
 from slam.frames import View
 from slam.loops.descriptors import hamming
 from slam.loops.retrieval import Apart, find_candidates, nearest_words, train_vocabulary
-from slam.loops.verification import LoopThresholds
-
-THRESHOLDS = LoopThresholds.of_frames(LoopsConfig())
+from slam.loops.verification import OF_FRAMES
 
 
 def place(rng: np.random.Generator) -> np.ndarray:
@@ -60,7 +57,7 @@ def test_descriptors_keep_their_word_through_flipped_bits() -> None:
 
 def test_revisited_places_are_found() -> None:
     views = drive(20, 5)
-    found = find_candidates(views, apart(np.arange(50.0)), THRESHOLDS)
+    found = find_candidates(views, apart(np.arange(50.0)), OF_FRAMES)
     best = {}
     for candidate in found:
         best.setdefault(candidate.later, candidate)
@@ -72,11 +69,11 @@ def test_revisited_places_are_found() -> None:
 
 @pytest.mark.parametrize("path_m", [np.zeros(50), np.linspace(0.0, 4.0, 50)])
 def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
-    assert find_candidates(drive(20, 5), apart(path_m), THRESHOLDS) == []
+    assert find_candidates(drive(20, 5), apart(path_m), OF_FRAMES) == []
 
 
 def test_candidates_are_few_and_apart() -> None:
-    found = find_candidates(drive(20, 5), apart(np.arange(50.0)), THRESHOLDS)
+    found = find_candidates(drive(20, 5), apart(np.arange(50.0)), OF_FRAMES)
     for later in {c.later for c in found}:
         earlier = [c.earlier for c in found if c.later == later]
         assert len(earlier) <= 2

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
 from slam.loops import verification
-from slam.loops.verification import Loop, LoopThresholds, LoopVerifier, RejectedLoop
+from slam.loops.verification import OF_FRAMES, Loop, LoopVerifier, RejectedLoop
 
 CAMERA = Intrinsics(width=416, height=128, fx=240.0, fy=240.0, cx=207.5, cy=63.5)
 T_A_B = from_rotation_vector(np.array([0.01, 0.08, -0.02]), np.array([0.7, 0.1, 2.0]))
@@ -36,11 +35,8 @@ class Scene:
         return self.view(3, self.points_a), self.view(90, self.points_b)
 
 
-THRESHOLDS = LoopThresholds.of_frames(LoopsConfig())
-
-
 def verify(earlier: View, later: View, **changes: float) -> Loop | RejectedLoop:
-    return LoopVerifier(replace(THRESHOLDS, **changes), CAMERA).verify(earlier, later, 0.7)
+    return LoopVerifier(replace(OF_FRAMES, **changes), CAMERA).verify(earlier, later, 0.7)
 
 
 def error(loop: Loop, T_true: FloatArray) -> tuple[float, float]:

@@ -5,6 +5,7 @@ import pytest
 
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
+from slam.mapping import filters, surface
 from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.mapping.tile_surface import TileSurface, with_holes_closed
@@ -19,10 +20,11 @@ def test_exposure_is_evened_out(street_map):
     assert 0.4 < changing.mean() < 0.75
 
 
-def test_a_view_without_depth_paints_nothing_right_before_it():
+def test_a_view_without_depth_paints_nothing_right_before_it(monkeypatch):
+    monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 10)
     camera = Intrinsics(104, 64, 60.0, 60.0, 51.5, 31.5)
     x, y = np.moveaxis(camera.rays(camera.pixel_grid()), -1, 0)[:2]
-    tsdf_map = TsdfMap(MappingConfig(min_weight=1, min_component_triangles=10), camera)
+    tsdf_map = TsdfMap(MappingConfig(), camera)
     for frame, z in enumerate((0.0, 0.5, 1.0, 7.85, 8.35)):  # a red plate at 8 m, unknown to the last two green views
         walls = 6 / np.maximum(np.abs(x), 0.01)
         is_plate = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)
@@ -44,15 +46,16 @@ def test_brightness_steps_become_small_gains():
     assert len(evened(np.array([np.nan]))) == 1
 
 
-def test_a_hole_of_the_road_is_closed_and_marked(street_map):
-    whole = street_map(hidden=True, close_holes_m=4.0, min_weight=2.0)
+def test_a_hole_of_the_road_is_closed_and_marked(street_map, monkeypatch):
+    monkeypatch.setattr(surface, "_LEAST_WEIGHT", 2.0)
+    whole = street_map(hidden=True, close_holes_m=4.0)
     mesh = whole.mesh()
     filled = mesh.vertices["filled"] > 0
     assert filled.sum() == 1
     np.testing.assert_allclose(mesh.points[filled][0], [0, 1.65, 20], atol=0.7)
     assert mesh.vertices["ny"][filled][0] < -0.99
     assert len(whole.cloud().points) == len(mesh.points) - 1
-    assert not street_map(hidden=True, close_holes_m=1.5, min_weight=2.0).mesh().vertices["filled"].any()
+    assert not street_map(hidden=True, close_holes_m=1.5).mesh().vertices["filled"].any()
 
 
 @pytest.mark.parametrize(("up", "closed"), [((0.0, 0.0, 1.0), 1), ((0.0, 0.0, -1.0), 0), ((1.0, 0.0, 0.0), 0)])
@@ -71,10 +74,11 @@ def test_only_holes_that_look_upwards_are_closed(up: tuple[float, float, float],
     assert (normals[:, 2] > 0).all()
 
 
-def test_how_far_depth_is_fused_depends_on_its_sigma():
+def test_how_far_depth_is_fused_depends_on_its_sigma(monkeypatch):
     camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
     depth = np.repeat(np.linspace(15, 40, 100, dtype=np.float32)[None], 50, axis=0)
-    config = MappingConfig(depth_max_m=20, certain_range_factor=1.5, certain_sigma_m=1.2, border=0, max_depth_step=10)
+    monkeypatch.setattr(filters, "_MAX_DEPTH_STEP", 10.0)
+    config = MappingConfig(depth_max_m=20)
     image = np.full((50, 100, 3), 90, np.uint8)
 
     def farthest(relative_sigma: np.ndarray | None) -> float:
@@ -83,4 +87,4 @@ def test_how_far_depth_is_fused_depends_on_its_sigma():
 
     assert 19 < farthest(None) < 20 and 19 < farthest(np.full_like(depth, 0.1)) < 20
     assert 23 < farthest(np.full_like(depth, 0.05)) <= 24  # 0.05 of 24 m is 1.2 m
-    assert 29 < farthest(np.full_like(depth, 0.02)) < 30
+    assert 27 < farthest(np.full_like(depth, 0.02)) < 28

@@ -4,8 +4,10 @@ import pytest
 from slam.config.sections import MappingConfig
 from slam.formats.ply import read_ply
 from slam.frames import Frame, Intrinsics
+from slam.frontend import drive
 from slam.frontend.drive import Keyframe
 from slam.geometry import se3
+from slam.mapping import filters, surface
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import SlamError
@@ -49,7 +51,7 @@ def street_map(noise=lambda depth, k: depth, frames: int = 12, **config) -> Tsdf
 
 
 def test_keyframes_that_are_uncertain_everywhere_are_left_out_and_hide_no_neighbour():
-    def drive(certain: range) -> TsdfMap:
+    def driven(certain: range) -> TsdfMap:
         tsdf_map = TsdfMap(MappingConfig(max_relative_sigma=0.3), CAMERA)
         for k in range(9):
             T_world_camera, is_certain = pose(0.0, 0.0, float(k)), k in certain
@@ -58,12 +60,12 @@ def test_keyframes_that_are_uncertain_everywhere_are_left_out_and_hide_no_neighb
             tsdf_map.integrate(KeyframeDepth(k, depth, sigma, GREY, T_world_camera))
         return tsdf_map
 
-    tsdf_map = drive(range(0, 9, 2))
+    tsdf_map = driven(range(0, 9, 2))
     statistics = tsdf_map.statistics()
     assert (statistics["frames_fused"], statistics["frames_left_out"]) == (5, 4)
     assert statistics["filters"]["agreement"] < 0.2
     assert np.quantile(distance_to_street(tsdf_map.mesh().points), 0.99) < 0.1
-    nothing = drive(range(0))
+    nothing = driven(range(0))
     assert nothing.statistics()["frames_left_out"] == 9
     with pytest.raises(SlamError, match=r"none of 9 keyframes .* mapping.max_relative_sigma=0.3"):
         nothing.surface()
@@ -71,7 +73,7 @@ def test_keyframes_that_are_uncertain_everywhere_are_left_out_and_hide_no_neighb
 
 def test_one_wall_lands_where_the_camera_saw_it():
     # Open3D wants T_camera_world: with the inverse the plate would lie at x = -1
-    tsdf_map = TsdfMap(MappingConfig(min_weight=2, min_component_triangles=10), CAMERA)
+    tsdf_map = TsdfMap(MappingConfig(), CAMERA)
     for z in (0.0, 0.5, 1.0):
         tsdf_map.integrate(KeyframeDepth(0, plate(8.0 - z), None, GREY, pose(1.0, 0.5, z)))
     vertices = tsdf_map.mesh().points
@@ -81,12 +83,14 @@ def test_one_wall_lands_where_the_camera_saw_it():
     np.testing.assert_allclose(tsdf_map.mesh().colours, 128, atol=3)
 
 
-def test_thinned_keyframes_keep_the_geometry():
-    config, spill_file = MappingConfig(width_px=70, min_weight=2, min_component_triangles=10), SpillFile()
+def test_thinned_keyframes_keep_the_geometry(monkeypatch):
+    monkeypatch.setattr(drive, "MAP_WIDTH_PX", 70)
+    monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 10)
+    spill_file = SpillFile()
     thinned = CAMERA.resized(70, round(CAMERA.height * 70 / CAMERA.width))
-    tsdf_map = TsdfMap(config, thinned)
+    tsdf_map = TsdfMap(MappingConfig(), thinned)
     for k, z in enumerate((0.0, 0.5, 1.0)):
-        keyframe = Keyframe.of(Frame(k, float(k), GREY), plate(8.0 - z), spill_file, config)
+        keyframe = Keyframe.of(Frame(k, float(k), GREY), plate(8.0 - z), spill_file)
         tsdf_map.integrate(KeyframeDepth(0, keyframe.depth_unscaled, None, keyframe.image, pose(1.0, 0.0, z)))
     vertices = tsdf_map.mesh().points
     np.testing.assert_allclose(vertices[:, 2], 8.0, atol=0.003)
@@ -100,12 +104,12 @@ def test_depth_inconsistent_between_views_is_left_out():
             depth[20:40, 90:120] = 5.0
         return depth
 
-    tsdf_map = street_map(ghost, min_weight=1)
+    tsdf_map = street_map(ghost)
     assert distance_to_street(tsdf_map.mesh().points).max() < 0.2
     assert tsdf_map.statistics()["filters"]["agreement"] > street_map().statistics()["filters"]["agreement"] + 0.001
 
 
-def test_flying_pixels_and_far_depth_are_left_out():
+def test_flying_pixels_and_far_depth_are_left_out(monkeypatch):
     near_wall = np.where(np.abs(X) < 0.3, 6.0, 14.0).astype(np.float32)
     # a network smears the edge over some pixels
     smeared = np.stack([np.convolve(row, np.ones(5) / 5, mode="same") for row in near_wall]).astype(np.float32)
@@ -113,14 +117,10 @@ def test_flying_pixels_and_far_depth_are_left_out():
     smeared[:8] = 60.0  # sky
 
     def fuse(max_depth_step):
-        config = MappingConfig(
-            max_depth_step=max_depth_step,
-            truncation_voxels=4.5,
-            min_weight=1,
-            min_component_triangles=0,
-            max_depth_difference=10.0,
-        )
-        tsdf_map = TsdfMap(config, CAMERA)
+        monkeypatch.setattr(filters, "_MAX_DEPTH_STEP", max_depth_step)
+        monkeypatch.setattr(filters, "_MAX_DEPTH_DIFFERENCE", 10.0)
+        monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
+        tsdf_map = TsdfMap(MappingConfig(truncation_voxels=4.5), CAMERA)
         for x in (0.0, 0.31):
             tsdf_map.integrate(KeyframeDepth(0, smeared, None, GREY, pose(x, 0.0, 0.0)))
         return tsdf_map.mesh().points
@@ -155,7 +155,7 @@ def test_files_are_written_whole_and_read_back(tmp_path):
 
 
 def test_a_map_goes_on_after_its_surface_was_asked_for():
-    whole, asked = (TsdfMap(MappingConfig(min_component_triangles=10), CAMERA) for _ in range(2))
+    whole, asked = (TsdfMap(MappingConfig(), CAMERA) for _ in range(2))
     for k in range(6):
         for tsdf_map in (whole, asked):
             position = pose(0.0, 0.0, float(k))
@@ -166,7 +166,7 @@ def test_a_map_goes_on_after_its_surface_was_asked_for():
     assert asked.mesh().points[:, 2].max() > whole.mesh().points[:, 2].max() - 0.5
 
 
-def test_a_car_that_comes_towards_the_camera_is_not_fused():
+def test_a_car_that_comes_towards_the_camera_is_not_fused(monkeypatch):
     """A plate 2 m across in front of the left wall, which comes as fast as the camera drives."""
 
     def oncoming(depth: np.ndarray, k: int) -> np.ndarray:
@@ -180,7 +180,8 @@ def test_a_car_that_comes_towards_the_camera_is_not_fused():
         x, y, z = tsdf_map.mesh().points.T
         return int(((np.abs(x + 4.0) < 0.9) & (y < 1.2) & (z < 24.0)).sum())
 
-    config = {"max_depth_difference": 0.3, "min_component_triangles": 0}
-    street_alone, with_car = street_map(frames=12, **config), street_map(oncoming, frames=12, **config)
+    monkeypatch.setattr(filters, "_MAX_DEPTH_DIFFERENCE", 0.3)
+    monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
+    street_alone, with_car = street_map(frames=12), street_map(oncoming, frames=12)
     assert with_car.statistics()["filters"]["moving"] > 0.001 > street_alone.statistics()["filters"]["moving"]
     assert ghosts(with_car) < 50

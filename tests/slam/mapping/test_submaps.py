@@ -4,11 +4,14 @@ from collections import Counter
 
 import numpy as np
 
+from slam.mapping import surface
 from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS
 
 
-def test_submaps_merge_to_the_surface_of_one(street_map):
-    one, many = street_map(submap_m=1e6), street_map(submap_m=3.0)
+def test_submaps_merge_to_the_surface_of_one(street_map, monkeypatch):
+    one = street_map()
+    monkeypatch.setattr("slam.mapping.map._SUBMAP_LENGTH", 3.0 / 20.0)
+    many = street_map()
     assert one.statistics()["submaps"] == 1 and many.statistics()["submaps"] >= 5
     assert many.statistics()["frames_fused"] == 18 and many.statistics()["frames_left_out"] == 0
     a, b = one.mesh(), many.mesh()
@@ -25,10 +28,12 @@ def test_little_memory_ends_a_submap_early_and_leaves_nothing_out(street_map):
     assert statistics["submaps"] > 1 and statistics["frames_fused"] == 18
 
 
-def test_tiles_are_joined_without_a_seam(street_map):
+def test_tiles_are_joined_without_a_seam(street_map, monkeypatch):
     """The road crosses the border of tiles at x = 0; with voxels of 0.1 m another one lies at z = 25.6."""
     # a wall without noise that was seen once lies on voxels exactly, whose vertices coincide
-    mesh = street_map(voxel_size_m=0.1, min_component_triangles=0, min_weight=2.0).mesh()
+    monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
+    monkeypatch.setattr(surface, "_LEAST_WEIGHT", 2.0)
+    mesh = street_map(voxel_size_m=0.1).mesh()
     vertices, triangles = mesh.points, mesh.triangles
     assert len(np.unique(vertices, axis=0)) == len(vertices)
     edges = Counter(map(tuple, np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).tolist()))

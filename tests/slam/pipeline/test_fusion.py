@@ -2,48 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from erfsfm.mvs.fusion import DepthFusion
-from slam.config.sections import MappingConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
-from slam.pipeline.fusion import KeyframeDepths
+from slam.mapping.filters import KeyframeDepth
+from slam.pipeline.fusion import keyframe_depths
 from slam.runtime.storage.spill import SpillFile
 
 CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
 FRAMES = 6
 
 
-def depths(step: float, guess_sigma: float | None, refined: bool = True) -> KeyframeDepths:
+def depths(step: float, guess_sigma: float | None, refined: bool = True) -> Callable[[int], KeyframeDepth]:
     """Of a camera that goes sideways by ``step`` a frame before a wall 5 m away."""
     spill_file, rng = SpillFile(), np.random.default_rng(0)
     frames = [Frame(k, float(k), rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)) for k in range(FRAMES)]
     wall = np.full((32, 64), 2.5, np.float32)
     drive = Drive(
-        keyframes=[Keyframe.of(frame, wall, spill_file, MappingConfig()) for frame in frames],
+        keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames],
         roads=[MeasurementFailure("no road")] * FRAMES,
     )
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)
     scale, decide = np.full(FRAMES, 2.0), DepthFusion("default").decide if refined else None
-    return KeyframeDepths(drive, scale, T_world_camera, DepthError(), CAMERA, decide, guess_sigma)
+    return keyframe_depths(drive, scale, T_world_camera, DepthError(), CAMERA, decide, guess_sigma)
 
 
 def test_what_no_neighbour_measures_has_the_sigma_of_a_guess() -> None:
-    standing = depths(0.0, guess_sigma=0.32).at(2)
+    standing = depths(0.0, guess_sigma=0.32)(2)
     assert standing.relative_sigma is not None
     np.testing.assert_allclose(standing.relative_sigma, 0.32)
     np.testing.assert_allclose(standing.depth, 5.0, rtol=1e-6)
-    moving = depths(0.4, guess_sigma=0.32).at(2)
+    moving = depths(0.4, guess_sigma=0.32)(2)
     assert moving.relative_sigma is not None and moving.relative_sigma.min() != pytest.approx(0.32)
 
 
 @pytest.mark.parametrize(("guess_sigma", "refined"), [(None, True), (0.32, False)])
 def test_depth_that_is_not_to_be_measured_has_no_sigma(guess_sigma: float | None, refined: bool) -> None:
-    standing = depths(0.0, guess_sigma, refined).at(2)
+    standing = depths(0.0, guess_sigma, refined)(2)
     assert standing.relative_sigma is None
     np.testing.assert_allclose(standing.depth, 5.0, rtol=1e-6)

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import functools
-import os
 import threading
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
-from threading import Barrier
-from typing import Any
 
 import numpy as np
 import pytest
@@ -59,7 +54,7 @@ def feed(slam: Slam, first: int, stop: int) -> None:
 @pytest.mark.slow
 def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_run() -> None:
     config = load_config(None, SETTINGS)
-    slam = started(config, update_frames=25, sweep_frames=120)
+    slam = started(config)
     feed(slam, 0, FRAMES - 9)
     before = slam.trajectory().T_world_camera
     feed(slam, FRAMES - 9, FRAMES)
@@ -76,7 +71,7 @@ def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_r
 
 
 def test_poses_of_the_whole_drive_stay_when_more_frames_come() -> None:
-    slam = started(load_config(None, SETTINGS), update_frames=10, sweep_frames=0)
+    slam = started(load_config(None, SETTINGS))
     feed(slam, 0, 32)
     slam.close_loops()
     before = slam.trajectory().T_world_camera
@@ -85,7 +80,7 @@ def test_poses_of_the_whole_drive_stay_when_more_frames_come() -> None:
 
 
 def test_the_trajectory_grows_with_the_frames() -> None:
-    slam = started(load_config(None, SETTINGS), update_frames=10)
+    slam = started(load_config(None, SETTINGS))
     with pytest.raises(SlamError, match="before the first frame"):
         slam.trajectory()
     for count in (1, 4, 12, 20):
@@ -97,7 +92,7 @@ def test_the_trajectory_grows_with_the_frames() -> None:
 
 
 def test_a_frame_gives_the_newest_pose_and_its_state() -> None:
-    slam = started(load_config(None, SETTINGS), update_frames=10)
+    slam = started(load_config(None, SETTINGS))
     poses = [slam.add_frame(drive().frame(k).image, drive().frame(k).stamp) for k in range(20)]
     assert poses[0].state == "starting" and poses[-1].state == "tracking"
     assert [pose.frame for pose in poses] == sorted(pose.frame for pose in poses) and poses[-1].frame >= 17
@@ -105,7 +100,7 @@ def test_a_frame_gives_the_newest_pose_and_its_state() -> None:
 
 
 def test_a_session_gives_its_points_keyframes_marginals_and_surface() -> None:
-    slam = started(load_config(None, SETTINGS), update_frames=10, with_map=True)
+    slam = started(load_config(None, SETTINGS), with_map=True)
     with pytest.raises(SlamError, match="too few usable frames"):
         slam.points()
     feed(slam, 0, 32)
@@ -168,11 +163,9 @@ def test_wrong_frames_and_modes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"image must be \(96, 312, 3\) uint8; got \(96, 312\)"):
         slam.add_frame(image[..., 0], 0.0)
     slam.add_frame(image, 1.0)
-    for stamp in (1.0, 0.5, np.nan, np.inf):
-        with pytest.raises(ValueError, match=rf"stamps must increase; got {stamp} after \[?1\.0\]?"):
+    for stamp in (1.0, 0.5, np.nan, np.inf, 1.7e18):
+        with pytest.raises(ValueError, match=rf"stamps must increase, in seconds; got {stamp} after"):
             slam.add_frame(image, stamp)
-    with pytest.raises(ValueError, match="stamps must be seconds"):
-        slam.add_frame(image, 1.7e18)
     assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
     with pytest.raises(SlamError, match="reference needs true poses; live has none"):
         started(load_config(None, ["scale.mode=reference"]))
@@ -182,18 +175,6 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
     with pytest.raises(SlamError, match="known needs frames of a whole sequence, and live grows"):
         started(load_config(None, ["scale.mode=known", "scale.known_between=[0,5]", "scale.known_m=3"]))
-
-
-@pytest.mark.parametrize("image", [None, [[1]], "image.png"])
-def test_an_image_that_is_no_array_is_refused(image: Any) -> None:
-    with pytest.raises(ValueError, match=rf"image must be .* uint8; got None {type(image).__name__}"):
-        started(load_config(None, SETTINGS)).add_frame(image, 0.0)
-
-
-@pytest.mark.parametrize("stamp", [None, "0.1", np.array([0.1, 0.2])])
-def test_a_stamp_that_is_no_number_is_refused(stamp: Any) -> None:
-    with pytest.raises(ValueError, match="a stamp must be a number of seconds; got"):
-        started(load_config(None, SETTINGS)).add_frame(drive().frame(0).image, stamp)
 
 
 @pytest.mark.parametrize(
@@ -210,19 +191,6 @@ def test_an_impossible_camera_is_refused(key: str, value: float) -> None:
         Slam(oracle(), intrinsics, load_config(None, SETTINGS), **height)
 
 
-@pytest.mark.parametrize("option", [{"update_frames": 0}, {"sweep_frames": -1}, {"seed": -1}, {"seed": 2**31}])
-def test_a_number_out_of_its_range_is_refused(option: dict[str, int]) -> None:
-    with pytest.raises(SlamError, match="wanted update_frames >= 1"):
-        started(load_config(None, SETTINGS), **option)
-
-
-def test_what_predicts_nothing_and_a_height_that_is_no_number_are_refused() -> None:
-    with pytest.raises(SlamError, match=r"predictor must be a Predictor, .*got NoneType"):
-        Slam(None, drive().intrinsics)
-    with pytest.raises(SlamError, match=r"camera_height_m must be metres .*got '1.65'"):
-        Slam(oracle(), drive().intrinsics, camera_height_m="1.65")
-
-
 def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
     class Small(OraclePredictor):
         def depth(self, frame: Frame) -> DepthMap:
@@ -233,44 +201,6 @@ def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
     slam = Slam(predictor, drive().intrinsics, load_config(None, SETTINGS))
     with pytest.raises(SlamError, match=r"depth of frame 0 must be \(96, 312\) float32; got \(48, 156\)"):
         feed(slam, 0, 2)
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_forked_process_is_told_what_to_do() -> None:
-    with started(load_config(None, SETTINGS)) as slam:
-        child = os.fork()
-        if not child:
-            try:
-                slam.add_frame(drive().frame(0).image, 0.0)
-            except SlamError as error:
-                os._exit("spawn" in str(error))
-            os._exit(2)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
-
-
-def test_threads_take_turns() -> None:
-    slam = started(load_config(None, SETTINGS))
-    ready, stamps = Barrier(4), iter(range(1000))
-
-    def add(index: int) -> None:
-        ready.wait()
-        for _ in range(2):
-            with suppress(ValueError):  # another thread's frame was later
-                slam.add_frame(drive().frame(index).image, float(next(stamps)))
-            slam.trajectory()
-
-    with ThreadPoolExecutor(4) as threads:
-        list(threads.map(add, range(4)))
-    assert len(slam.trajectory()) == len(slam) > 0
-
-
-def test_a_trajectory_belongs_to_the_caller() -> None:
-    slam = started(load_config(None, SETTINGS))
-    feed(slam, 0, 2)
-    slam.trajectory().stamps[:] = 1e9
-    slam.trajectory().T_world_camera[:] = np.nan
-    feed(slam, 2, 4)
-    assert np.isfinite(slam.trajectory().T_world_camera).all()
 
 
 class Failing(OraclePredictor):
@@ -302,7 +232,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     """An error that nobody foresaw costs a frame: one row a frame, whether the next image is usable or not."""
     predictor = Failing(8, question)
     config = load_config(None, [*SETTINGS, "visual_odometry.enabled=true", "loops.enabled=false"])
-    with Slam(predictor, drive().intrinsics, config, drive().camera_height_m, update_frames=100) as slam:
+    with Slam(predictor, drive().intrinsics, config, drive().camera_height_m0) as slam:
         for k in range(20):
             frame = drive().frame(k)
             image = np.zeros_like(frame.image) if following == "black" and k == 9 else frame.image
@@ -316,13 +246,6 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     reference = drive().reference
     assert reference is not None
     assert np.linalg.norm(trajectory.positions[-1]) > 0.5 * np.linalg.norm(reference[19, :3, 3])
-
-
-def test_a_failure_at_the_last_frame_is_a_gap() -> None:
-    slam = Slam(Failing(8, "snippet"), drive().intrinsics, load_config(None, SETTINGS), drive().camera_height_m)
-    with slam:
-        feed(slam, 0, 9)
-        assert len(slam.trajectory()) == len(slam) == 9
 
 
 def test_a_closed_session_has_no_threads_and_keeps_its_results() -> None:
@@ -344,7 +267,7 @@ def test_a_closed_session_has_no_threads_and_keeps_its_results() -> None:
 def test_a_buffer_that_is_reused_is_a_new_frame() -> None:
     """A camera driver may write every image to the same memory."""
     config = load_config(None, ["mapping.enabled=false", "loops.enabled=false"])
-    slam, buffered = (started(config, sweep_frames=0) for _ in range(2))
+    slam, buffered = (started(config) for _ in range(2))
     feed(slam, 0, 9)
     buffer = np.empty_like(drive().frame(0).image)
     for k in range(9):

@@ -24,7 +24,7 @@ from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.sequences.catalogue import open_sequence
 
-CONFIG = SlamConfig(keyframes=KeyframesConfig(max_corners=400))
+CONFIG = SlamConfig()
 
 
 def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> FloatArray:
@@ -41,7 +41,7 @@ def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometry]:
     """Two maps, and the true poses; on the way back the camera is rolled and closer."""
     walked = there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:30], walked[48:]])
-    return truth, room.tracked(CONFIG.keyframes, truth, [0] * 30 + [9] * 9 + [0] * 53)
+    return truth, room.tracked(truth, [0] * 30 + [9] * 9 + [0] * 53)
 
 
 def closed(state: KeyframeOdometry) -> MapClosure:
@@ -100,7 +100,7 @@ def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(monkey
     monkeypatch.setattr(map_closure, "find_loops", find)
     back, closer = there_and_back(90, roll=0.02), there_and_back(110, roll=0.5, closer=0.3)
     truth = np.concatenate([back, back[:6], closer[95:]])
-    after = closed(room.tracked(CONFIG.keyframes, truth, [0] * 90 + [9] * 6 + [0] * 15))
+    after = closed(room.tracked(truth, [0] * 90 + [9] * 6 + [0] * 15))
     assert [event.event for event in after.joins] == ["map joined"]
     assert errors(after.poses, truth)[0] < 0.01
 
@@ -109,7 +109,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     walked = there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:60], walked[82:]])
     seeds = [0] * 60 + [9] * 6 + [0] * 22
-    tracking = KeyframeTracking(KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0)
+    tracking = KeyframeTracking(KeyframesConfig(use="always"), CONFIG.loops, room.INTRINSICS, 0)
     for k, T in enumerate(truth):
         frame = room.frame(k, T, seeds[k])
         tracking.follow(frame)
@@ -139,7 +139,7 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
     places: list[int], unseen: Sequence[int], sparse: Sequence[int], relocalised: list[int]
 ) -> None:
     truth = there_and_back(110, roll=0.4, closer=0.3)[places]
-    tracking = KeyframeTracking(KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0)
+    tracking = KeyframeTracking(KeyframesConfig(use="always"), CONFIG.loops, room.INTRINSICS, 0)
     for k, T in enumerate(truth):
         frame = room.frame(k, T, 9 if k in unseen else 0)
         tracking.follow(frame)
@@ -174,7 +174,7 @@ def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.Monk
 @pytest.mark.slow
 def test_another_scene_is_no_loop() -> None:
     walked = there_and_back(110)
-    after = closed(room.tracked(CONFIG.keyframes, np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
+    after = closed(room.tracked(np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
     assert after.loops.accepted == ()
     assert after.joins == ()
     assert len(set(after.poses.segments.values())) == 2
@@ -188,7 +188,7 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
     sequence = open_sequence(recording / "images")
     indices = range(0, 320, 4)
     truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)
-    odometry = KeyframeOdometry(KeyframesConfig(), sequence.intrinsics)
+    odometry = KeyframeOdometry(sequence.intrinsics)
     flat = np.ones((sequence.intrinsics.height, sequence.intrinsics.width), np.float32)
     for k in indices:
         frame = replace(sequence.frame(k), index=k // 4)

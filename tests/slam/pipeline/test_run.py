@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import threading
-import weakref
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -16,18 +14,17 @@ from oracle import OracleNoise, OraclePredictor
 
 from erfsfm.common.errors import SHOW_TRACEBACK
 from erfsfm.common.progress import Progress, silent
-from erfsfm.inference import DepthPosePredictor
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, SnippetPoses
+from slam.frontend import drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
-from slam.prediction.assembly import NetworkPredictor
 from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import Excerpt
@@ -243,24 +240,6 @@ def threads(before: Collection[threading.Thread]) -> set[str]:
     return {thread.name for thread in alive if thread.name.startswith(prefixes)}
 
 
-def test_a_result_holds_neither_threads_nor_networks(tiny_weights: Path) -> None:
-    street = SimulatedSequence(SimulationOptions("straight", 9, 1002, 208, 64))
-    networks = DepthPosePredictor.from_weights(tiny_weights)
-    predictor = NetworkPredictor(networks, street.intrinsics)
-    during: set[str] = set()
-    before = threading.enumerate()  # other tests may have left some
-    pipeline = SlamPipeline(
-        street, predictor, load_config(None, ["mapping.enabled=false"]), lambda *_: during.update(threads(before))
-    )
-    result = pipeline.run()
-    assert {"networks_0", "beside_0"} <= during and threads(before) == set()
-    alive = weakref.ref(predictor), weakref.ref(networks)
-    del pipeline, predictor, networks
-    gc.collect()
-    assert [each() for each in alive] == [None, None]
-    assert len(result.optimised) == 9
-
-
 def test_threads_end_where_a_run_fails() -> None:
     """The depth of one frame cannot be computed: the error is the run's, and nothing goes on in the background."""
 
@@ -292,7 +271,7 @@ def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
 def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     noise = OracleNoise(np.deg2rad(0.3))
-    options = ("visual_odometry.enabled=true", "visual_odometry.corner_spacing_px=3", "visual_odometry.min_inliers=20")
+    options = ("visual_odometry.enabled=true",)
     result = run(still, *options, noise=noise)
     assert {factor.source for factor in result.drive.steps.relative_poses} == {STILL_SOURCE}
     rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
@@ -326,13 +305,7 @@ def drive_street(
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
-    overrides = [
-        "visual_odometry.corner_spacing_px=4",
-        "visual_odometry.min_inliers=20",
-        f"scale.mode={mode}",
-        f"depth.frame_stride={stride}",
-    ]
-    settings = load_config(None, overrides)
+    settings = load_config(None, [f"scale.mode={mode}", f"depth.frame_stride={stride}"])
     return SlamPipeline(street, oracle, settings, progress).run()
 
 
@@ -383,9 +356,9 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt)
     assert result.map.statistics()["triangles"] > 5000
 
 
-def test_mapping_thins_frames_and_can_be_left_out(street: Excerpt) -> None:
+def test_depth_is_thinned_for_the_map(street: Excerpt, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drive, "MAP_WIDTH_PX", 104)
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
-    settings = load_config(None, ["mapping.frame_stride=5", "mapping.width_px=104", "visual_odometry.enabled=false"])
+    settings = load_config(None, ["visual_odometry.enabled=false"])
     seen = SlamPipeline(street, oracle, settings).run().drive
-    assert [keyframe.index for keyframe in seen.keyframes] == [0, 5, 10, 15, 20]
     assert seen.keyframes[0].image.shape == (32, 104, 3) and seen.keyframes[0].depth_unscaled.shape == (32, 104)

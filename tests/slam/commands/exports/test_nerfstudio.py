@@ -16,7 +16,7 @@ from slam.commands.export import R_UP_WORLDS, export
 from slam.formats.ply import Ply
 from slam.geometry.se3 import invert
 from slam.results.folder import RunFolder
-from slam.results.metrics import Metrics, Provenance
+from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import open_sequence
@@ -78,18 +78,6 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     assert content["fl_x"] == camera.fx and content["k1"] == 0
 
 
-def test_nothing_of_a_scene_before_stays(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    written = export(folder, "nerfstudio", tmp_path / "scene")
-    (written / "images" / "mine.png").write_text("not of an export")
-    (tmp_path / "drive" / "03.png").write_text("broken")
-    (folder.path / "map_cloud.ply").unlink()
-    export(folder, "nerfstudio", written)
-    names = [Path(frame["file_path"]).name for frame in scene(written)["frames"]]
-    assert sorted(path.name for path in (written / "images").iterdir()) == sorted([*names, "mine.png"])
-    assert len(names) == 7 and not (written / "points.ply").exists()
-
-
 def test_frames_without_a_usable_image_are_left_out(
     make_recorded: MakeRecorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -138,13 +126,6 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     assert "\n" not in str(caught.value) and not (tmp_path / "scene").exists()
     written = export(folder, "nerfstudio", tmp_path / "scene", "z", dataset=tmp_path / "elsewhere")
     assert len(scene(written)["frames"]) == 8
-
-
-def test_a_run_that_does_not_say_where_its_images_are(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    folder.write_metrics(folder.metrics().changed(provenance=Provenance()))
-    with pytest.raises(RunError, match="does not record where its images are: give --dataset ROOT"):
-        export(folder, "nerfstudio", tmp_path / "scene")
 
 
 def test_another_recording_is_refused(make_recorded: MakeRecorded, tmp_path: Path) -> None:

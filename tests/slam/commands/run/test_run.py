@@ -9,16 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 
-import slam.commands.run.run
-import slam.results.estimate_metrics
 from erfsfm.common.signals import Terminated
 from slam import run_slam
-from slam.commands.run import recorder
-from slam.graph.pose_graph import PoseGraph
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
@@ -170,21 +165,6 @@ def test_unreadable_scans_are_left_out_and_reported(
         run_slam(**again | {"overrides": [*reported.get("overrides", ()), "scale.mode=lidar"]})
 
 
-def test_a_run_that_is_killed_while_its_report_is_written_has_not_ended(
-    reported: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen, write = [], recorder.write_report
-
-    def spied(folder: RunFolder, *parts: Any) -> None:
-        seen.append(folder.metrics().status)
-        write(folder, *parts)
-
-    monkeypatch.setattr(recorder, "write_report", spied)
-    folder = run_slam(**reported, output=tmp_path / "run")
-    assert seen == ["estimated"] and folder.metrics().status == "ok"
-    assert ">FAILED<" not in (folder.path / "report.html").read_text()
-
-
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
@@ -220,20 +200,3 @@ def test_impossible_runs_make_no_folder(quick: dict[str, Any], tmp_path: Path) -
         with pytest.raises(SlamError):
             run_slam(**quick | wish, output=tmp_path / "none")
     assert not (tmp_path / "none").exists()
-
-
-def test_outside_a_checkout_or_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", "/nowhere")
-    assert slam.commands.run.run.commit() == ""
-
-
-def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: RunFolder) -> None:
-    class Result:
-        optimised = run.trajectory("network")
-        reference = run.trajectory("reference")
-        graph = PoseGraph()
-
-    assert Result.optimised is not None
-    Result.optimised.T_world_camera[:] = np.eye(4)
-    graph = slam.results.estimate_metrics._graph(Result)  # type: ignore[arg-type]
-    assert "does not move" in graph.coverage.absent

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +18,6 @@ from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.commands.cli import main
 from slam.commands.run.recorder import FolderRecorder
-from slam.formats.ply import read_ply
-from slam.formats.trajectory import read_trajectory
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
@@ -49,17 +45,6 @@ def call(*arguments: object) -> int:
     return int(stopped.value.code or 0)
 
 
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Every write beyond ``size`` bytes of a file fails, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 def test_an_unknown_argument_is_named() -> None:
     with pytest.raises(TypeError, match="sped"):
         run_slam(**{"sped": 3})  # type: ignore[misc]
@@ -79,12 +64,6 @@ def test_an_argument_of_another_kind_is_named(quick: dict[str, Any], option: dic
     with pytest.raises(RunError, match=f"run_slam: {next(iter(option))}: "):
         run_slam(**quick | {"output": tmp_path / "run"} | option)
     assert not (tmp_path / "run").exists()
-
-
-def test_a_link_to_nothing_is_no_place_for_a_run(quick: dict[str, Any], tmp_path: Path) -> None:
-    (tmp_path / "run").symlink_to(tmp_path / "unmounted")
-    with pytest.raises(RunError, match=r"run is a link to .*unmounted, which is not there"):
-        run_slam(**quick, output=tmp_path / "run")
 
 
 @pytest.mark.parametrize("content", [{"config.yaml": "mine"}, {"metrics.json": '{"loss": 1}', "config.yaml": "mine"}])
@@ -142,34 +121,6 @@ def test_a_run_that_breaks_off_has_its_reason_and_is_replaced(
     assert b"the run failed" in after["run.log"]
     assert run_slam(**quick | {"frames": "0:9"}, output=output).metrics().tree()["sequence"]["frames"] == 9
     assert set(contents(output)) == set(before)
-
-
-@pytest.mark.slow
-def test_a_disk_that_is_full_at_the_map(kitti_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    overrides = ["visual_odometry.enabled=false", "output.report=false", "loops.enabled=false"]
-    overrides += ["mapping.voxel_size_m=0.1", "mapping.submap_m=3", "depth.refine=none"]
-    arguments = ["run", "--dataset", kitti_root, "--weights", "sim", "--frames", "0:7"]
-    arguments += [word for override in overrides for word in ("--set", override)]
-    whole, full = tmp_path / "whole", tmp_path / "full"
-    assert call(*arguments, "--output", whole) == 0
-    size = (whole / "map_mesh.ply").stat().st_size
-    capfd.readouterr()
-    with largest_file(size - 1):
-        assert call(*arguments, "--output", full) == 1
-    out, err = capfd.readouterr()
-    assert out == "" and err.count("\n") == 1
-    assert "the map cannot be kept in" in err and "(File too large): make room" in err
-    metrics = json.loads((full / "metrics.json").read_text())
-    assert metrics["status"] == "failed" and "the map cannot be kept" in metrics["reason"]
-    assert metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
-    assert len(read_trajectory(full / "trajectory_optimised.tum.txt")) == 7
-    assert not any(path.name.startswith(".") or path.suffix == ".ply" for path in full.iterdir())
-    capfd.readouterr()
-    with largest_file(size - 1):
-        assert call("export", whole, "--what", "mesh", "--up", "z", "--output", tmp_path / "up.ply") == 1
-    assert capfd.readouterr().err.count("\n") == 1 and not (tmp_path / "up.ply").exists()
-    assert call("export", whole, "--what", "mesh", "--up", "z", "--output", tmp_path / "up.ply") == 0
-    assert len(read_ply(tmp_path / "up.ply").vertices) == len(read_ply(whole / "map_mesh.ply").vertices)
 
 
 @pytest.mark.parametrize("stage", ["loops", "graph", "map", "report"])
@@ -244,17 +195,6 @@ def test_a_terminated_run_has_its_reason(
     metrics = RunFolder.open(tmp_path / "run").metrics().tree()
     assert (metrics["status"], metrics["reason"]) == ("failed", f"ended by {name}")
     assert metrics["trajectories"]["optimised"]["align"] and metrics["map"] is None
-
-
-def test_the_command_line_says_which_signal_ended_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def terminated(*_: object, **__: object) -> None:
-        raise Terminated(15)
-
-    monkeypatch.setattr("slam.commands.run.run.perform", terminated)
-    assert call("run") == 143
-    assert capsys.readouterr().err == "erfsfm-slam: ended by SIGTERM; what was written stays\n"
 
 
 KILLED = """

@@ -5,14 +5,11 @@ import numpy as np
 import pytest
 import room
 
-from slam.config.sections import KeyframesConfig
 from slam.frames import KEYFRAME_SOURCE, Intrinsics
 from slam.frontend.keyframes.local_map import LocalMap, TrackIds
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
-
-CONFIG = KeyframesConfig(max_corners=200)
 
 
 def poses(state: KeyframeOdometry) -> KeyframePoses:
@@ -28,7 +25,7 @@ def chained(found: KeyframePoses) -> dict[int, FloatArray]:
 
 def test_a_hand_held_camera_is_followed() -> None:
     truth = room.walk(70)
-    state = room.tracked(CONFIG, truth)
+    state = room.tracked(truth)
     found = poses(state)
     T = chained(found)
     assert sorted(T) == list(range(70))
@@ -49,7 +46,7 @@ def test_a_hand_held_camera_is_followed() -> None:
 def test_a_map_begins_on_a_plane(seed: int) -> None:
     """A wall faced squarely fits many essential matrices: with seed 5 theirs turned the camera by 90 degrees."""
     truth = room.walk(50)
-    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS, seed)
+    odometry = KeyframeOdometry(room.INTRINSICS, seed)
     for k, T_world_camera in enumerate(truth):
         odometry.follow(room.frame(k, T_world_camera, near=False))
         odometry.learn(room.frame(k, T_world_camera, near=False), room.depth_map(T_world_camera))
@@ -65,7 +62,7 @@ def test_without_parallax_the_camera_has_its_turn_and_stays(motion: str) -> None
     truth = room.walk(25, step_m=0.0, turn=0.004)
     if motion == "standing":
         truth[:] = np.eye(4)
-    T = chained(poses(room.tracked(CONFIG, truth)))
+    T = chained(poses(room.tracked(truth)))
     assert sorted(T) == list(range(25))
     estimate = np.stack([T[k] for k in range(25)])
     turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
@@ -75,7 +72,7 @@ def test_without_parallax_the_camera_has_its_turn_and_stays(motion: str) -> None
 
 def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
     walked = room.walk(30)
-    state = room.tracked(CONFIG, np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
+    state = room.tracked(np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
     keyframes = state.segments[0].map.keyframes
     assert keyframes[-1].index <= 31
     T = chained(poses(state))
@@ -86,7 +83,7 @@ def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
 
 def test_another_scene_begins_another_map() -> None:
     walked = room.walk(80)
-    state = room.tracked(CONFIG, walked, [0] * 35 + [7] * 45)
+    state = room.tracked(walked, [0] * 35 + [7] * 45)
     found = poses(state)
     assert len(set(found.segments.values())) == 2
     assert max(frame for frame, number in found.segments.items() if number == 0) < 35
@@ -100,7 +97,7 @@ def test_a_walk_that_begins_with_a_turn_is_one_map() -> None:
     yaw = np.deg2rad(np.arange(-33.0, 0.0, 3.0))
     turned = from_rotation_vector(np.outer(yaw, [0.0, 1.0, 0.0]), np.zeros((len(yaw), 3)))
     truth = np.concatenate([turned, room.walk(30)])
-    state = room.tracked(CONFIG, truth)
+    state = room.tracked(truth)
     assert [event.event for event in state.events] == ["map begun"]
     found = poses(state)
     assert sorted(found.segments) == list(range(len(truth)))
@@ -111,7 +108,7 @@ def test_a_walk_that_begins_with_a_turn_is_one_map() -> None:
 
 
 def test_without_learned_depth_there_is_no_map() -> None:
-    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
+    odometry = KeyframeOdometry(room.INTRINSICS)
     for k, T in enumerate(room.walk(6)):
         view = room.frame(k, T)
         odometry.follow(view)
@@ -123,7 +120,7 @@ def test_without_learned_depth_there_is_no_map() -> None:
 def test_a_short_move_has_its_length_by_learned_depth() -> None:
     """A hundredth of the depth is too little parallax for points of their own; learned depth is twice the depth."""
     truth = from_rotation_vector(np.zeros((5, 3)), np.outer(np.arange(5), [0.01, 0.0, 0.0]))
-    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
+    odometry = KeyframeOdometry(room.INTRINSICS)
     for k, T in enumerate(truth):
         view = room.frame(k, T, near=False)
         odometry.follow(view)
@@ -136,7 +133,7 @@ def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn() -> None:
     """Between sharp and blurred images: the camera turns on in the same map."""
     yaw = np.concatenate([np.zeros(5), np.deg2rad(np.arange(1.0, 13.0))])
     truth = from_rotation_vector(np.outer(yaw, [0.0, 1.0, 0.0]), np.zeros((len(yaw), 3)))
-    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
+    odometry = KeyframeOdometry(room.INTRINSICS)
     for k, T in enumerate(truth):
         view = room.frame(k, T)
         if 5 <= k < 12:
@@ -160,7 +157,7 @@ def test_the_newest_keyframe_keeps_the_pose_of_its_adjustment(monkeypatch: pytes
         return gone
 
     monkeypatch.setattr(LocalMap, "adjust", recorded)
-    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
+    odometry = KeyframeOdometry(room.INTRINSICS)
     for k, T in enumerate(room.walk(30)):
         odometry.follow(room.frame(k, T))
         odometry.learn(room.frame(k, T), room.depth_map(T))

@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from slam import frames
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.tracking import CornerTracker
@@ -20,7 +19,6 @@ from slam.frontend.visual.step_noise import StepNoise
 from slam.geometry import se3
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
-CONFIG = VisualOdometryConfig()
 UNIT = 0.3  # unscaled lengths per metre
 NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
 RAYS = CAMERA.rays(CAMERA.pixel_grid())
@@ -53,11 +51,11 @@ def render(T_world_camera: np.ndarray, texture: np.ndarray, index: int = 0) -> t
     return Frame(index, 0.1 * index, image), depth.astype(np.float32)
 
 
-def measure(T_previous_current, texture, depth_error=lambda depth: depth, config=CONFIG, seed=0):
+def measure(T_previous_current, texture, depth_error=lambda depth: depth, seed=0):
     start = se3.from_rotation_vector(np.array([0.01, -0.02, 0.0]), np.array([0.3, 0.1, 2.0]))
     previous, depth = render(start, texture, 4)
     current, _ = render(start @ T_previous_current, texture, 5)
-    odometry = VisualOdometry(config, CAMERA, seed=seed)
+    odometry = VisualOdometry(CAMERA, seed=seed)
     return odometry.measure(previous, current, depth_error(UNIT * depth), 1.65 * UNIT)
 
 
@@ -152,7 +150,7 @@ def behind_block(frame: Frame, left: int, ratio: tuple[float, float] = (0.6, 0.8
 def test_what_passes_before_the_camera_is_not_the_world(texture, forward):
     """It covers half of the image and has most of the corners there."""
     T_previous_current = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, forward]))
-    odometry, T_world_camera, frames = VisualOdometry(CONFIG, CAMERA), np.eye(4), []
+    odometry, T_world_camera, frames = VisualOdometry(CAMERA), np.eye(4), []
     for k in range(36):
         frame, depth = render(T_world_camera, texture, k)
         noise = np.random.default_rng(k).normal(0.0, 1.0, frame.image.shape)
@@ -168,15 +166,13 @@ def test_what_passes_before_the_camera_is_not_the_world(texture, forward):
 
 def test_failures_carry_a_reason(texture):
     black = Frame(0, 0.0, np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
-    failure = VisualOdometry(CONFIG, CAMERA).measure(black, black, np.ones(black.image.shape[:2], np.float32))
+    failure = VisualOdometry(CAMERA).measure(black, black, np.ones(black.image.shape[:2], np.float32))
     assert isinstance(failure, MeasurementFailure)
     assert "only 0 corners could be tracked" in failure.reason
     rotation = se3.from_rotation_vector(np.deg2rad([0.0, 2.0, 0.0]), np.zeros(3))
     failure = measure(rotation, texture, lambda depth: np.full_like(depth, np.nan))
     assert isinstance(failure, MeasurementFailure)
     assert "trusted depth" in failure.reason
-    failure = measure(rotation, texture, config=VisualOdometryConfig(min_inliers=5000, max_corners=10000))
-    assert isinstance(failure, MeasurementFailure)
 
 
 def test_far_depth_is_not_trusted(texture, monkeypatch):
@@ -197,7 +193,7 @@ def test_frames_two_apart_are_measured_beside_neighbours(texture):
     frames, _ = drive(texture)
     answers = []
     for _ in range(2):
-        odometry = VisualOdometry(CONFIG, CAMERA)
+        odometry = VisualOdometry(CAMERA)
         for k in range(5):
             for step in (1, 2):
                 if k >= step:
@@ -209,7 +205,7 @@ def test_frames_two_apart_are_measured_beside_neighbours(texture):
 
 def test_a_rotation_across_two_steps_is_measured_in_its_two_images(texture):
     frames, poses = drive(texture, (0.1, 1.5, 0.0))
-    odometry = VisualOdometry(CONFIG, CAMERA)
+    odometry = VisualOdometry(CAMERA)
     steps = [pose_of(odometry.measure(a[0], b[0], a[1])).T_from_to for a, b in itertools.pairwise(frames[:3])]
     first, last = frames[0], frames[2]
     across = odometry.relative_rotation(first[0], last[0], first[1], steps[0] @ steps[1])()
@@ -225,7 +221,7 @@ def test_track_ids_link_the_lengths_of_neighbouring_steps(texture):
     """Learned depth that changes its unit between frames does not enter the ratio of lengths."""
     steps = (1.0, 1.4, 0.7, 0.7)
     frames, _ = drive(texture, (0.0, 1.0, 0.0), steps)
-    odometry = VisualOdometry(CONFIG, CAMERA)
+    odometry = VisualOdometry(CAMERA)
     motions = [
         odometry.measure(first[0], second[0], first[1] * np.float32(1 + 0.3 * (k % 2)))
         for k, (first, second) in enumerate(itertools.pairwise(frames))
@@ -257,7 +253,7 @@ def test_the_true_length_makes_the_motion_true(texture):
 def test_a_rejected_motion_updates_neither_history_nor_dynamic_mask(texture):
     """Corners agree on a motion, but too few of them have a depth near enough to be trusted for its length."""
     frames, _ = drive(texture)
-    odometry = VisualOdometry(CONFIG, CAMERA)
+    odometry = VisualOdometry(CAMERA)
     steps = [(a[0], b[0], a[1]) for a, b in itertools.pairwise(frames)]
     for step in steps[:2]:
         pose_of(odometry.measure(*step, 1.65))
@@ -283,7 +279,7 @@ def predictions(texture, steps, failing=()) -> dict[tuple[int, int], bool]:
         predicted[previous.index, current.index] = flow is not None
         return track(self, previous, current, flow, standing)
 
-    odometry = VisualOdometry(CONFIG, CAMERA)
+    odometry = VisualOdometry(CAMERA)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CornerTracker, "track", watched)
         for first, second in steps:
@@ -342,7 +338,7 @@ def test_rotation_on_real_frames(data_root, name, first, last, block, largest_de
         frames.append(behind_block(frame, 16 * (k + 1 - first) - round(0.6 * grey.shape[1])) if block else frame)
     height, width = frames[0].image.shape[:2]
     intrinsics = Intrinsics(width, height, P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2])
-    odometry = VisualOdometry(CONFIG, intrinsics)
+    odometry = VisualOdometry(intrinsics)
     constant = np.full((height, width), 10.0, np.float32)
     rotations_deg = []
     for previous, current in itertools.pairwise(frames):

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.visual.predicted_flow import PredictedFlow
@@ -89,9 +88,8 @@ def errors(tracks: Tracks) -> np.ndarray:
 
 def test_corners_on_the_road_are_tracked_through_the_predicted_flow(frames):
     """Also with a length that is wrong by a tenth, as learned depth is."""
-    config = VisualOdometryConfig()
-    plain = errors(CornerTracker(config).track(*frames))
-    predicted = errors(CornerTracker(config).track(*frames, predicted_flow(0.9 * LENGTH)))
+    plain = errors(CornerTracker().track(*frames))
+    predicted = errors(CornerTracker().track(*frames, predicted_flow(0.9 * LENGTH)))
     right_plain, right_predicted = ((np.abs(each).max(axis=1) < 0.3).sum() for each in (plain, predicted))
     assert right_predicted > max(2 * right_plain, 25)
     assert abs(np.median(predicted[:, 1])) < 0.15
@@ -99,9 +97,8 @@ def test_corners_on_the_road_are_tracked_through_the_predicted_flow(frames):
 
 def test_a_wrong_prediction_moves_corners_by_fractions_of_a_pixel(frames):
     """Of a standing camera whose flow is predicted as if it went on at full speed, by some ten pixels near the car."""
-    config = VisualOdometryConfig()
     still = [frames[0], Frame(1, 0.1, frames[0].image)]
-    tracks = CornerTracker(config).track(*still, predicted_flow())
+    tracks = CornerTracker().track(*still, predicted_flow())
     assert len(tracks.track_ids) > 100
     median, most = np.quantile(np.abs(tracks.current - tracks.previous).max(axis=1), [0.5, 0.9])
     assert median < 0.15 and most < 0.7

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
@@ -19,7 +18,6 @@ from slam.geometry.epipolar import UnitRelativePose, unit_pose_by_essential
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
-CONFIG = VisualOdometryConfig()
 FOCAL_PX = 240.0
 CAR = 40
 NO_HISTORY = MotionHistory()
@@ -27,7 +25,7 @@ NO_HISTORY = MotionHistory()
 
 def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int = 0) -> TwoViewEstimate:
     """The motion of one step after some history."""
-    found = TwoViewEstimator(CONFIG, FOCAL_PX, seed=seed).estimate(matches, history)
+    found = TwoViewEstimator(FOCAL_PX, seed=seed).estimate(matches, history)
     assert found is not None
     return found
 
@@ -107,14 +105,14 @@ def test_a_known_motion_is_refined():
     direction = T_current_previous[:3, 3] / np.linalg.norm(T_current_previous[:3, 3])
     off = se3.from_rotation_vector(np.deg2rad([0.05, 0.1, -0.05]), np.zeros(3))[:3, :3]
     start = UnitRelativePose(off @ T_current_previous[:3, :3], direction)
-    refined = TwoViewEstimator(CONFIG, FOCAL_PX).refined(matches, start)
+    refined = TwoViewEstimator(FOCAL_PX).refined(matches, start)
     assert refined is not None
     assert angle_deg(refined.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.06
 
 
 def test_the_estimator_has_no_state():
     """A step whose history is not kept changes no later one."""
-    estimator = TwoViewEstimator(CONFIG, FOCAL_PX)
+    estimator = TwoViewEstimator(FOCAL_PX)
     first, second = (corner_with_a_car(seed)[0] for seed in (0, 1))
     alone = estimator.estimate(second, NO_HISTORY)
     estimator.estimate(first, NO_HISTORY)
@@ -144,7 +142,7 @@ def test_without_common_points_there_is_no_motion():
     rng = np.random.default_rng(0)
     rays = [np.column_stack([rng.uniform(-0.8, 0.8, (12, 2)), np.ones(12)]) for _ in range(2)]
     matches = matches_of(*rays, np.full(12, np.nan))
-    assert TwoViewEstimator(CONFIG, FOCAL_PX).estimate(matches, NO_HISTORY) is None
+    assert TwoViewEstimator(FOCAL_PX).estimate(matches, NO_HISTORY) is None
 
 
 @pytest.mark.parametrize("first", [264])
@@ -153,7 +151,7 @@ def test_a_car_that_turns_off_in_rain_does_not_turn_the_camera(first):
     hazards = ("moving-cars", "exposure", "blur", "stop", "rain")
     street = SimulatedStreet(SimulationOptions("loop", 400, 611, hazards=hazards))
     intrinsics = Intrinsics(416, 128, *street.K[[0, 1, 0, 1], [0, 1, 2, 2]])
-    odometry = VisualOdometry(CONFIG, intrinsics)
+    odometry = VisualOdometry(intrinsics)
     frames = [street.render(k) for k in range(first, first + 4)]
     for previous, current in itertools.pairwise(frames):
         images = (Frame(each.index, each.stamp, each.image) for each in (previous, current))
@@ -180,7 +178,7 @@ def plain_road(seed: int, length: float = 0.9) -> tuple[Matches, np.ndarray, np.
 
 def test_learned_depth_that_sees_far_things_too_near_casts_out_no_near_corner():
     errors_deg, kept = [], []
-    estimator = TwoViewEstimator(CONFIG, 720.0)
+    estimator = TwoViewEstimator(720.0)
     for seed in range(200):
         matches, near, T_current_previous = plain_road(seed)
         found = estimator.estimate(matches, NO_HISTORY)

@@ -15,7 +15,7 @@ from slam.runtime.errors import SlamError
 
 @pytest.fixture
 def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any]:
-    overrides = ["mapping.width_px=104", "visual_odometry.enabled=false", "output.report=false"]
+    overrides = ["visual_odometry.enabled=false", "output.report=false"]
     return {"dataset": kitti_root, "weights": tiny_weights, "overrides": overrides, "output": tmp_path / "run"}
 
 

@@ -193,13 +193,6 @@ def test_a_failed_run_has_its_reason(make_run: MakeRun) -> None:
     assert "FAILED" in html
 
 
-def test_a_damaged_loops_file_leaves_the_rest_of_the_report(make_run: MakeRun) -> None:
-    folder = make_run()
-    folder.write_text("loops.json", "{")
-    write_report(folder)
-    assert "12 candidates" in parsed(folder)[0]
-
-
 def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun) -> None:
     folder = make_run()
     late = folder.trajectory("odometry")

@@ -83,11 +83,7 @@ def measured(
 ) -> Float32Array:
     """Points x, y, z (LiDAR frame, metres) and reflectance in [0, 1] of the rays that came back, ``(M, 4)``.
 
-    Args:
-        directions: unit, LiDAR frame, ``(N, 3)``.
-        ranges_m: exact, infinite where nothing was hit, ``(N,)``.
-        reflectance: of what was hit, ``(N,)``.
-        rng: of the range noise.
+    Of rays in unit directions ``(N, 3)``, with exact ranges ``(N,)``, infinite where nothing was hit.
     """
     kept = (ranges_m > NEAREST_M) & (ranges_m < FARTHEST_M)
     noisy = ranges_m[kept] + rng.normal(0.0, RANGE_NOISE_M, int(kept.sum()))

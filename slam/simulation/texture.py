@@ -239,17 +239,8 @@ Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
 
 
 def shade(material: Material, texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """Unlit colour of some pixels of one material.
-
-    Args:
-        material: of all of them.
-        texels: where they look, ``(N,)`` each.
-        colours: the two base colours of their instances, ``(2, 3, N)``.
-        parameters: of their instances, ``(PARAMETERS, N)``.
-
-    Returns:
-        RGB, about [0, 1], ``(3, N)``.
-    """
+    """Unlit RGB ``(3, N)``, about [0, 1], of texels of one material, by the two colours ``(2, 3, N)`` and the
+    parameters ``(PARAMETERS, N)`` of their instances."""
     return _SHADERS[material](texels, colours, parameters)
 
 

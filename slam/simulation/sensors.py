@@ -35,14 +35,9 @@ def footprint(
 ) -> tuple[Float32Array, Float32Array]:
     """Extent of a pixel on a surface along its u and v axes, grazing angle included.
 
-    A round pixel of size f seen at angle a to the normal is an ellipse of axes f and f / cos a; along a
-    tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a).
-
-    Args:
-        pixel: size of the pixel at the surface's distance, metres, ``(N,)``.
-        rays: unit, ``(3, N)``.
-        normals: unit, ``(3, N)``.
-        tangents: unit direction of u, ``(3, N)``.
+    A round pixel of size f ``(N,)``, metres at the surface's distance, seen by rays at angle a to the normals is an
+    ellipse of axes f and f / cos a; along a tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a). All directions are
+    unit, ``(3, N)``.
     """
     cosine = np.abs((rays * normals).sum(axis=0))
     along_u = (rays * tangents).sum(axis=0)

@@ -63,9 +63,7 @@ def cell_hash(u: Float32Array, v: Float32Array, salt: int) -> Float32Array:
 def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Array:
     """Sum of noise octaves, each faded out where its waves are smaller than about two pixels.
 
-    Args:
-        texels: texture coordinates.
-        octaves: wavelength along u, wavelength along v (metres), amplitude.
+    An octave is the wavelength along u and along v in metres, and the amplitude.
     """
     total = np.zeros_like(texels.u)
     for k, (wave_u, wave_v, amplitude) in enumerate(octaves):

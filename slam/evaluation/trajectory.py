@@ -315,12 +315,10 @@ def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ou
     """The statistics of ``7dof`` again, computed by evo alone, and the largest disagreement with ours."""
     if ours.ate_rmse_m is None:
         return EvoMetrics.unknown(ours.why("ate_rmse_m"))
-    try:
-        from evo import EvoException
-        from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
-        from evo.core.trajectory import PosePath3D
-    except ImportError as error:
-        return EvoMetrics.unknown(f"evo cannot be imported ({error})")
+    from evo import EvoException
+    from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
+    from evo.core.trajectory import PosePath3D
+
     estimate, reference = PosePath3D(poses_se3=[*T_world_estimate]), PosePath3D(poses_se3=[*T_world_reference])
     values = {}
     try:

@@ -35,7 +35,6 @@ class TsdfMap:
     def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
         """Prepare for depth maps and images of these ``intrinsics``."""
         self._config = config
-        self._size = (intrinsics.height, intrinsics.width)
         self._intrinsics = intrinsics
         self._filters = DepthFilters(config, intrinsics)
         self._views = ViewChooser(self._filters, config.depth_max_m)
@@ -55,11 +54,8 @@ class TsdfMap:
         Raises:
             SlamError: the disk is full.
         """
-        depth, image = keyframe.depth, keyframe.image
-        if depth.shape != self._size or image.shape != (*self._size, 3):
-            raise ValueError(f"depth and image must be {self._size}; got {depth.shape} and {image.shape}")
-        known = np.isfinite(depth) & (depth > 0)
-        known_depth = np.where(known, depth, np.float32(0)).astype(np.float32)
+        depth = keyframe.depth
+        known_depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)).astype(np.float32)
         view = replace(keyframe, depth=known_depth, network_depth=None)
         if not self._filters.trusted(view).any():
             self._left_out += 1

@@ -61,7 +61,7 @@ def check_output(output: Path) -> None:
     """Check that a run may write to ``output``: it is new, empty, or holds an earlier run.
 
     Raises:
-        RunError: it is a file, or holds files of something else, or a folder where a run has a file.
+        RunError: it is a file, or holds files of something else.
     """
     if output.is_symlink() and not output.exists():
         raise RunError(f"{output} is a link to {output.readlink()}, which is not there: choose another --output")
@@ -71,9 +71,6 @@ def check_output(output: Path) -> None:
         raise RunError(f"{output} is a file: give a folder as --output")
     if not _is_run(output / METRICS) and any(not _is_rest(path) for path in output.iterdir()):
         raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
-    for path in output.iterdir():
-        if path.name in MEANINGS and path.is_dir():
-            raise RunError(f"{path} is a folder, where a run writes a file: move it away, or choose another --output")
 
 
 def claim(output: Path) -> None:

@@ -89,13 +89,7 @@ class Soup:
         return len(self._materials) - 1
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
-        """Add a grid of quads.
-
-        Args:
-            points: plan coordinates of the grid's vertices, ``(R, C, 3)``.
-            uv: texture coordinates in metres, ``(R, C, 2)``.
-            instance: from :meth:`instance`.
-        """
+        """Add a grid of quads: vertices in the plan ``(R, C, 3)`` and texture coordinates in metres ``(R, C, 2)``."""
         triangles = _patch_triangles(points.shape[0], points.shape[1])
         self._vertices.append(points.reshape(-1, 3))
         self._uv.append(uv.reshape(-1, 2)[triangles])

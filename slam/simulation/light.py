@@ -81,13 +81,7 @@ def sky(weather: Weather, directions: Float32Array) -> Float32Array:
 
 
 def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32Array:
-    """Irradiance on surfaces that face the viewer, ``(3, N)``.
-
-    Args:
-        weather: of the world.
-        normals: unit, towards the viewer, ``(3, N)``.
-        lit: 1 where the sun is seen, ``(N,)``.
-    """
+    """Irradiance ``(3, N)`` on surfaces of unit normals ``(3, N)`` towards the viewer; ``lit`` is 1 in the sun."""
     direct = weather.sunshine * np.clip(weather.sun @ normals, 0.0, 1.0) * lit
     around = weather.ambient * (0.78 + 0.22 * normals[2])
     warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
@@ -96,15 +90,7 @@ def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32
 
 
 def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px: float) -> Float32Array:
-    """Colour of each hit in the open, ``(3, N)``.
-
-    Args:
-        mesh: what was hit.
-        hits: where, sorted by material.
-        lit: 1 where the sun is seen, ``(N,)``.
-        weather: of the world.
-        focal_px: focal length in pixels.
-    """
+    """Colour ``(3, N)`` of each hit on a mesh in the open; ``lit`` ``(N,)`` is 1 where the sun is seen."""
     rgb = unlit(mesh, hits, focal_px)
     if weather.contrast != 1.0:
         base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)

@@ -181,9 +181,7 @@ def _standing(walk: Carried, seconds: float) -> FloatArray:
 def illuminate(surface: Surface, lights: FloatArray) -> Float32Array:
     """Irradiance at the corners of triangles, about 1 below a lamp, ``(3, T)``.
 
-    Args:
-        surface: triangles that face the side that is seen.
-        lights: position and strength of each, ``(L, 4)``.
+    ``lights`` ``(L, 4)`` are positions and strengths; triangles face the side that is seen.
     """
     mesh = surface.mesh
     triangles = mesh.triangles.astype(np.int64)

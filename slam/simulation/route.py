@@ -45,15 +45,10 @@ class Route:
 
 
 def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None) -> Route:
-    """Lay out streets and a drive of ``frames`` frames over them.
+    """Lay out streets and a drive of so many frames over them; ``still_frames`` stand in the middle.
 
-    Args:
-        route: ``loop`` drives its start again, ``grid`` repeats streets in both directions (with about
-            250 frames), ``straight`` never comes back.
-        frames: how many poses.
-        seed: decides everything.
-        still_frames: how long to stand still in the middle.
-        variety: of street and camera; None for a town and a camera like KITTI's.
+    A ``loop`` drives its start again, a ``grid`` repeats streets in both directions (with about 250 frames), and
+    ``straight`` never comes back. Without a ``variety`` it is a town, and a camera like KITTI's.
 
     Raises:
         SequenceError: if there are too few frames for the route.

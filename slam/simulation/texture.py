@@ -63,9 +63,7 @@ def cell_hash(u: Float32Array, v: Float32Array, salt: int) -> Float32Array:
 def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Array:
     """Sum of noise octaves, each faded out where its waves are smaller than about two pixels.
 
-    Args:
-        texels: texture coordinates.
-        octaves: wavelength along u, wavelength along v (metres), amplitude.
+    An octave is the wavelength along u and along v in metres, and the amplitude.
     """
     total = np.zeros_like(texels.u)
     for k, (wave_u, wave_v, amplitude) in enumerate(octaves):
@@ -239,17 +237,8 @@ Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
 
 
 def shade(material: Material, texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """Unlit colour of some pixels of one material.
-
-    Args:
-        material: of all of them.
-        texels: where they look, ``(N,)`` each.
-        colours: the two base colours of their instances, ``(2, 3, N)``.
-        parameters: of their instances, ``(PARAMETERS, N)``.
-
-    Returns:
-        RGB, about [0, 1], ``(3, N)``.
-    """
+    """Unlit RGB ``(3, N)``, about [0, 1], of texels of one material, by the two colours ``(2, 3, N)`` and the
+    parameters ``(PARAMETERS, N)`` of their instances."""
     return _SHADERS[material](texels, colours, parameters)
 
 

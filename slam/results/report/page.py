@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -20,14 +19,12 @@ from slam.results.report import tables
 from slam.results.report.map_view import MapView
 from slam.results.report.verdict import verdict
 from slam.results.tables import alignments_table, errors_table, missing_errors
-from slam.runtime.errors import RunError, SlamError
+from slam.runtime.errors import SlamError
 from slam.runtime.run_files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.storage.record import NOT_RECORDED
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
-
-logger = logging.getLogger(__name__)
 
 _ALIGNED = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
 _AS_WRITTEN = "As written; no ground truth is known. The raw network chain is scaled to the rest."
@@ -74,11 +71,14 @@ def write_report(
         metrics: of the run; None reads ``metrics.json``.
 
     Raises:
-        RunError: ``metrics.json`` is damaged.
+        RunError: a file of the folder is damaged.
     """
     metrics = metrics or folder.metrics()
     said, errors = verdict(metrics), metrics.evaluated_errors()
     no_errors, optimised = missing_errors(errors), metrics.trajectories.optimised
+    found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
+    drawn = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
+    accepted = LoopsFile.read(folder.path / LOOPS).accepted or [] if (folder.path / LOOPS).is_file() else []
     no_map = metrics.map.absent or ("" if metrics.map.triangles is not None else metrics.map.why("triangles"))
     page = _TEMPLATES.get_template("page.html.j2").render(
         script=(files("slam.results.report") / "page.js").read_text("utf-8"),
@@ -87,7 +87,7 @@ def write_report(
         folder=folder,
         metrics=metrics,
         verdict=said,
-        plots=_plots(metrics, _trajectories(folder), _accepted(folder), view),
+        plots=_plots(metrics, drawn, accepted, view),
         errors=errors_table(errors) if errors and not no_errors else None,
         alignments=alignments_table(optimised) if not optimised.absent and not no_errors else None,
         no_errors=no_errors,
@@ -99,27 +99,9 @@ def write_report(
     folder.write_text(REPORT, page)
 
 
-def _accepted(folder: RunFolder) -> list[AcceptedLoop]:
-    """The accepted loops; none where ``loops.json`` is missing or damaged."""
-    try:
-        return LoopsFile.read(folder.path / LOOPS).accepted or []
-    except (OSError, RunError):
-        return []
-
-
 def _absence(metrics: Metrics, reason: str) -> str:
     """Why a run has no such part; empty where it has one, or failed before."""
     return "" if metrics.failure and reason == NOT_RECORDED else reason
-
-
-def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
-    """The trajectories to draw, the reference first; none if a file is damaged, so that the report is still written."""
-    try:
-        found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
-    except SlamError as error:
-        logger.info("the report shows no trajectories: %s", error)
-        return {}
-    return {name: trajectory for name, trajectory in found.items() if trajectory is not None}
 
 
 def _plots(

@@ -58,7 +58,6 @@ def what_ran(metrics: Metrics) -> Table:
     sequence, ran = metrics.sequence, metrics.provenance
     frames = sequence.frames and f"{sequence.frames} frames"
     rate = sequence.fps and f"{sequence.fps:.1f} a second"
-    depth = "by these weights" if ran.depth_source == "network" else ran.depth_source
     shas = [sha and f"sha256 {sha[:16]}" for sha in (ran.weights_sha256, ran.depth_sha256)]
     rows = [
         ("Sequence", _joined(sequence.name, frames, rate)),
@@ -67,7 +66,7 @@ def what_ran(metrics: Metrics) -> Table:
         ("LiDAR scans left out", "; ".join(by_reason(sequence.unreadable_scans or ()))),
         ("Scale", _scale(metrics)),
         ("Weights", _joined(ran.weights, shas[0])),
-        ("Depth", _joined(depth, shas[1])),
+        ("Depth", "" if ran.depth_source == "network" else _joined(ran.depth_source, shas[1])),
         ("Licence of the weights", ran.weights_licence),
         ("Trained on", _shortened(ran.trained_on or ())),
         ("Leak", {True: "yes: trained on this sequence", False: "none known", None: ""}[ran.leak]),
@@ -139,7 +138,7 @@ def files(folder: RunFolder) -> Table | None:
 
 
 def _joined(*parts: object) -> str:
-    return ", ".join(str(each) for each in parts if each is not None)
+    return ", ".join(str(each) for each in parts if each not in (None, ""))
 
 
 def _scale(metrics: Metrics) -> str:

@@ -2,9 +2,6 @@
 
 import json
 import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -211,24 +208,6 @@ def test_limits() -> None:
     assert lines[0].startswith("align.7dof.ate_rmse_m is 0.09")
     assert lines[0].endswith("over the limit 0.01")
     assert lines[1].startswith("align.7dof.t_rel_percent is not known (no segment of 100 m")
-
-
-def test_evo_writes_nothing_to_the_home_folder(tmp_path: Path) -> None:
-    program = (
-        "import sys, numpy as np\n"
-        "from slam.evaluation.trajectory import trajectory_metrics\n"
-        "from slam.formats.trajectory import Trajectory\n"
-        "assert 'evo' not in sys.modules and 'torch' not in sys.modules\n"
-        "T = np.tile(np.eye(4), (9, 1, 1)); T[:, :3, 3] = np.random.rand(9, 3)\n"
-        "t = Trajectory(np.arange(9.0), T)\n"
-        "assert trajectory_metrics(t, t).evo.difference < 1e-6\n"
-        "assert 'evo' in sys.modules\n"
-    )
-    environment = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.data

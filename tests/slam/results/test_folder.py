@@ -79,16 +79,6 @@ def test_files_of_other_programs_are_not_replaced(tmp_path: Path, name: str, tex
     assert contents(tmp_path) == {name: text.encode()}
 
 
-def test_a_folder_with_the_name_of_a_file_is_refused_while_the_earlier_run_is_whole(make_run: MakeRun) -> None:
-    folder = make_run().path
-    (folder / "run.log").unlink(missing_ok=True)
-    (folder / "run.log").mkdir()
-    before = sorted(folder.iterdir())
-    with pytest.raises(RunError, match=r"run\.log is a folder, where a run writes a file"):
-        RunFolder.create(folder, folder.parent, "sim")
-    assert sorted(folder.iterdir()) == before
-
-
 def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplog: pytest.LogCaptureFixture) -> None:
     folder = make_run()
     RunFolder.open(folder.path)

@@ -24,6 +24,8 @@ from slam.results.output import check_replaced
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
 
+What = Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"]
+Up = Literal["y-down", "z"]
 # from a camera's x right, y down, z ahead
 R_UP_WORLDS: dict[Up, FloatArray] = {
     "y-down": np.eye(3),
@@ -35,8 +37,6 @@ _SCENES = {
     "nerfstudio": ("a scene", ("images", POINTS, TRANSFORMS), is_own_scene),
 }
 RESOLUTION = 0.1  # of an occupancy grid
-What = Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"]
-Up = Literal["y-down", "z"]
 
 
 def export(

@@ -98,8 +98,8 @@ def close_loops(
 def find_loops(views: Sequence[View], track: Track, apart: Apart, verifier: LoopVerifier) -> LoopClosures:
     """Loops among the views of a track that are verified and agree with each other.
 
-    The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says which
-    may make a loop, see `find_candidates`.
+    The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says
+    which may make a loop, see `find_candidates`.
     """
     candidates = find_candidates(views, apart, verifier.thresholds)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)

@@ -225,11 +225,9 @@ def _sampled(points: FloatArray, candidates: Indices) -> Indices:
 def _surface_along(
     truth: SurfaceTruth, views: Indices, T_world_camera: FloatArray, cameras: cKDTree, stretch: Indices
 ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray, FloatArray]:
-    """The true surface around a stretch, from these views.
+    """The true surface around a stretch, from these views, as the function from points ``(P, 3)`` to their distances.
 
-    Returns:
-        distances ``(P,)`` of points ``(P, 3)`` to it, samples ``(S, 3)`` of what images show of it whose nearest camera
-        is on the stretch, and that distance ``(S,)``.
+    With it samples ``(S, 3)`` of what images show of it whose nearest camera is on the stretch, and that distance.
     """
     surface = accumulated(truth, views, T_world_camera[stretch, :3, 3])
     samples = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]

@@ -98,11 +98,8 @@ def close_loops(
 def find_loops(views: Sequence[View], track: Track, apart: Apart, verifier: LoopVerifier) -> LoopClosures:
     """Loops among the views of a track that are verified and agree with each other.
 
-    Args:
-        views: in time order, of some rows of the track, their points in the units of their maps.
-        track: the odometry.
-        apart: which views may make a loop, see `find_candidates`.
-        verifier: of candidates.
+    The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says
+    which may make a loop, see `find_candidates`.
     """
     candidates = find_candidates(views, apart, verifier.thresholds)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
@@ -134,10 +131,7 @@ def _least_path(views: Sequence[View], is_metric: bool) -> float:
 def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[Loop]:
     """The loops with the sigmas of one loop together wherever several join the same two places, of a car that waits.
 
-    Args:
-        loops: that are accepted.
-        path: distance driven up to each frame ``(N,)``.
-        near: along it, within which two frames show the same place with the same errors.
+    Two frames less than ``near`` apart along the ``path`` ``(N,)`` show the same place with the same errors.
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)

@@ -159,8 +159,8 @@ def _loops(found: LoopClosures) -> records.LoopMetrics:
     if found.not_sought is not None:
         return records.LoopMetrics.of(**dict.fromkeys(counts, Failed(found.not_sought)), rejected=[])
     rejected = found.rejected[:MOST_REJECTED]
-    ends = [records.LoopEnds(from_=each.from_index, to=each.to_index, reason=each.reason) for each in rejected]
-    return records.LoopMetrics(**counts, rejected=ends)
+    ends = [records.LoopEnds.of(from_=each.from_index, to=each.to_index, reason=each.reason) for each in rejected]
+    return records.LoopMetrics.of(**counts, rejected=ends)
 
 
 def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:

@@ -55,11 +55,11 @@ class Localisation:
     """
 
     image: str
-    number: int = 0
     T_world_camera: FloatArray | None = None
     nearest_frame: int | None = None
     inliers: int = 0
     reason: str = ""
+    number: int = 0
 
     def tree(self) -> dict[str, Any]:
         """For JSON: unknown values are null, with the reason."""
@@ -118,7 +118,7 @@ def localise(
             unreadable += isinstance(error, DataError)
             if unreadable == len(numbers):
                 raise  # not one of them is an image
-            found.append(Localisation(name, number, reason=str(error)))
+            found.append(Localisation(name, reason=str(error), number=number))
         progress("images", len(found), len(numbers))
     return found
 

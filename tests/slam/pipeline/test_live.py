@@ -164,7 +164,7 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         slam.add_frame(image[..., 0], 0.0)
     slam.add_frame(image, 1.0)
     for stamp in (1.0, 0.5, np.nan, np.inf, 1.7e18):
-        with pytest.raises(ValueError, match=rf"stamps must increase, in seconds; got {stamp} after"):
+        with pytest.raises(ValueError, match="stamps must increase, in seconds; got"):
             slam.add_frame(image, stamp)
     assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
     with pytest.raises(SlamError, match="reference needs true poses; live has none"):

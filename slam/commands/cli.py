@@ -246,11 +246,11 @@ def localize(
     """
     from slam.commands.localisation import localisation_table, localise, write_localisations
     from slam.results.folder import RunFolder
-    from slam.results.output_file import check_replaced_trajectory
+    from slam.results.output import check_replaced
 
     run_folder = RunFolder.open(map)
     if output is not None:
-        check_replaced_trajectory(output)
+        check_replaced(output)
     with progress_bar() as progress:
         found = localise(images, run_folder, camera, frames, every, progress)
     if output is not None:
@@ -298,9 +298,10 @@ def simulate(
     Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
     """
     from slam.simulation.kitti_layout import simulated_world, write_kitti_root
-    from slam.simulation.options import parse_options
+    from slam.simulation.options import SimulationOptions
 
-    world = simulated_world(parse_options(route, frames, seed, width, height, hazards, varied, motion, rate))
+    named = tuple(name.strip() for name in hazards.split(",") if name.strip())
+    world = simulated_world(SimulationOptions(route, frames, seed, width, height, named, varied, motion, rate))
     with progress_bar() as progress:
         write_kitti_root(world, output, depth, lidar, lambda done: progress("frames", done, frames), mesh)
     typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")

@@ -13,7 +13,7 @@ from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
 from slam.formats.trajectory import associate
 from slam.results.folder import RunFolder
-from slam.results.output_file import check_replaced
+from slam.results.output import check_replaced
 from slam.results.systems import compare, named_paths, systems_table, trajectory_at, write_csv
 from slam.results.tables import alignments_table, runs_json, runs_table
 from slam.runtime.errors import SlamError

@@ -20,7 +20,7 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
-from slam.results.output_file import check_replaced
+from slam.results.output import check_replaced
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
 

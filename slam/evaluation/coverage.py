@@ -12,7 +12,6 @@ from scipy.special import chdtri, fdtri
 from slam.frames import RelativePose
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import whitened_squared
-from slam.runtime.errors import SlamError
 
 LEVELS = (50, 90, 95)
 
@@ -27,13 +26,8 @@ def coverage(
     Args:
         relative_poses: measurements with their noise, at least one.
         T_world_camera_true: truth ``(N, 4, 4)``, metres.
-        scale: units of the measurements per metre; scales the truth to them.
-
-    Raises:
-        SlamError: if there is no measurement or the scale is not positive.
+        scale: units of the measurements per metre, positive; scales the truth to them.
     """
-    if not relative_poses or not scale > 0:
-        raise SlamError(f"coverage needs factors and a positive scale; got {len(relative_poses)} and {scale}")
     T_world_camera = T_world_camera_true.copy()
     T_world_camera[:, :3, 3] *= scale
     squared = whitened_squared(relative_poses, T_world_camera)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import RunError
 from slam.runtime.run_files import REFERENCE
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -34,15 +33,6 @@ class SegmentErrors:
     rotation: FloatArray
 
 
-@dataclass(frozen=True)
-class Drift:
-    """Mean errors per metre over segments of one path length: ``translation`` a ratio, ``rotation`` in radians."""
-
-    length_m: float
-    translation: float
-    rotation: float
-
-
 def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     """Estimates brought to the reference by the best similarity of positions (Umeyama 1991).
 
@@ -50,10 +40,10 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     """
     drawn = dict(trajectories)
     if REFERENCE in drawn:
-        for name, trajectory in estimates(drawn):
-            estimate, truth = associate(trajectory, drawn[REFERENCE])
+        for name in trajectories.keys() - {REFERENCE}:
+            estimate, truth = associate(drawn[name], drawn[REFERENCE])
             fit = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
-            drawn[name] = replace(trajectory, T_world_camera=fit.apply_to_poses(trajectory.T_world_camera))
+            drawn[name] = replace(drawn[name], T_world_camera=fit.apply_to_poses(drawn[name].T_world_camera))
     elif "network" in drawn and "optimised" in drawn:
         raw, optimised = associate(drawn["network"], drawn["optimised"])
         energy = float((raw.positions**2).sum())
@@ -64,15 +54,10 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
 
 
 def paired(trajectories: Mapping[str, Trajectory]) -> Iterator[tuple[str, Trajectory, Trajectory]]:
-    """Name, aligned estimate and truth, row by row, of every estimate.
-
-    Raises:
-        RunError: there is no reference.
-    """
-    if REFERENCE not in trajectories:
-        raise RunError("errors and drift need ground truth, and this run has no reference")
-    for name, trajectory in estimates(aligned(trajectories)):
-        yield name, *associate(trajectory, trajectories[REFERENCE])
+    """Name, aligned estimate and truth, row by row, of every estimate; a reference is among the trajectories."""
+    for name, trajectory in aligned(trajectories).items():
+        if name != REFERENCE:
+            yield name, *associate(trajectory, trajectories[REFERENCE])
 
 
 def segment_errors(
@@ -111,17 +96,3 @@ def relative_errors(
     T_start_end_reference = se3.invert(T_world_reference[starts]) @ T_world_reference[ends]
     T_error = se3.invert(T_start_end_estimate) @ T_start_end_reference
     return np.linalg.norm(T_error[:, :3, 3], axis=1), se3.rotation_angle(T_error[:, :3, :3])
-
-
-def segment_drifts(estimate: Trajectory, reference: Trajectory) -> list[Drift]:
-    """Mean drift over segments of each of ``FIGURE_LENGTHS_M``; row k of the estimate belongs to row k."""
-    segments = segment_errors(estimate.T_world_camera, reference.T_world_camera, FIGURE_LENGTHS_M)
-    return [
-        Drift(each.length_m, *(float(error.mean()) / each.length_m for error in (each.translation_m, each.rotation)))
-        for each in segments
-    ]
-
-
-def estimates(trajectories: Mapping[str, Trajectory]) -> list[tuple[str, Trajectory]]:
-    """All but the reference, by name."""
-    return [(name, trajectory) for name, trajectory in trajectories.items() if name != REFERENCE]

@@ -8,7 +8,7 @@ error.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,18 +20,19 @@ from slam.evaluation.surface import (
     RANGE_M,
     SAMPLE_VOXEL_M,
     SPARSE_VIEW_STEP_M,
+    VIEW_STEP_DEG,
     VIEW_STEP_M,
     Indices,
     SurfaceTruth,
     accumulated,
     length_m,
-    moved_frames,
     nearby,
     stretches,
     thinned,
 )
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
+from slam.mapping.views import moved_rows
 from slam.runtime.attempt import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part
@@ -130,24 +131,6 @@ class MapDistances:
     to_map: FloatArray
     surface_range: FloatArray
 
-    def between(self, from_m: float, to_m: float) -> MapDistances:
-        """The errors of points at such distances from the nearest camera, half-open."""
-        own = (self.map_range >= from_m) & (self.map_range < to_m)
-        true = (self.surface_range >= from_m) & (self.surface_range < to_m)
-        return self._of(own, true)
-
-    def _of(self, own: Mask, true: Mask) -> MapDistances:
-        map_part = (self.to_surface[own], self.map_range[own], self.in_field[own])
-        return MapDistances(*map_part, self.to_map[true], self.surface_range[true])
-
-    def headline(self) -> MapDistances:
-        """The errors of all map points, and of the true surface within 20 m of a camera."""
-        return self._of(np.ones(len(self.to_surface), dtype=bool), self.surface_range < NEAR_CAMERA_M)
-
-    def where_measured(self) -> MapDistances:
-        """Without map points that the truth's sensor could not have seen."""
-        return self._of(self.in_field, np.ones(len(self.to_map), dtype=bool))
-
 
 def compare(
     truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, FloatArray]
@@ -160,10 +143,11 @@ def compare(
         maps: points ``(P, 3)`` in the world of the true poses, by name; they share the cost of the truth.
     """
     parts = stretches(T_world_camera, truth.frames)
-    views = moved_frames(T_world_camera, truth.frames, VIEW_STEP_M if truth.distance is None else SPARSE_VIEW_STEP_M)
+    step_m = VIEW_STEP_M if truth.distance is None else SPARSE_VIEW_STEP_M
+    views = truth.frames[moved_rows(T_world_camera[truth.frames], step_m, VIEW_STEP_DEG)]
     cameras = cKDTree(T_world_camera[:, :3, 3])
     nearest = {name: cameras.query(points, distance_upper_bound=RANGE_M) for name, points in maps.items()}
-    found: dict[str, list[MapDistances]] = {name: [] for name in maps}
+    found: dict[str, list[tuple[NDArray[Any], ...]]] = {name: [] for name in maps}
     for stretch in parts:
         near = nearby(T_world_camera, views, stretch)
         to_surface, on_surface, surface_range = _surface_along(truth, near, T_world_camera, cameras, stretch)
@@ -172,9 +156,10 @@ def compare(
             own = _sampled(points, np.flatnonzero(np.isin(camera, stretch) & np.isfinite(away)))
             distances = to_surface(points[own]) if len(own) else np.empty(0)
             in_field, to_map = truth.in_field(points[own], near), _to_map(on_surface, points)
-            found[name].append(MapDistances(distances, away[own], in_field, to_map, surface_range))
+            found[name].append((distances, away[own], in_field, to_map, surface_range))
         del to_surface  # it holds the surface
-    return {name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts)
+    together = {name: MapDistances(*map(np.concatenate, zip(*each))) for name, each in found.items()}
+    return together, length_m(T_world_camera, parts)
 
 
 _Kind = TypeVar("_Kind", bound=SurfaceMetrics)
@@ -183,20 +168,26 @@ _Placed = TypeVar("_Placed", bound=PlacedMetrics)
 
 def placed_metrics(kind: type[_Placed], distances: MapDistances, **more: Any) -> _Placed:
     """All errors of a placed map, also by distance from the nearest camera, with ``more`` values of their record."""
-    whole = distances.headline()
+    own, true = distances.to_surface, distances.to_map
+    in_field, near = distances.in_field, distances.surface_range < NEAR_CAMERA_M
     curve = []
     for from_m, to_m in BINS_M:
-        ring = distances.between(from_m, to_m)
-        points = {"map_points": len(ring.to_surface), "surface_points": len(ring.to_map)}
-        curve.append(_metrics(SurfaceMetrics, ring, _LEAST_IN_BIN, from_m=from_m, to_m=to_m, **points))
-    share = _share(whole.in_field) if len(whole.in_field) else _NO_MAP
-    in_field = _metrics(SurfaceMetrics, whole.where_measured(), 1, share=share)
-    return _metrics(kind, whole, 1, in_field=in_field, by_distance=curve, **more)
+        of_map = (distances.map_range >= from_m) & (distances.map_range < to_m)
+        of_surface = (distances.surface_range >= from_m) & (distances.surface_range < to_m)
+        ring = {
+            "from_m": from_m,
+            "to_m": to_m,
+            "map_points": int(of_map.sum()),
+            "surface_points": int(of_surface.sum()),
+        }
+        curve.append(_metrics(SurfaceMetrics, own[of_map], true[of_surface], _LEAST_IN_BIN, **ring))
+    share = _share(in_field) if len(in_field) else _NO_MAP
+    fair = _metrics(SurfaceMetrics, own[in_field], true[near], 1, share=share)
+    return _metrics(kind, own, true[near], 1, in_field=fair, by_distance=curve, **more)
 
 
-def _metrics(kind: type[_Kind], distances: MapDistances, least: int, **more: Any) -> _Kind:
-    """Accuracy, completeness and F-scores of these points, missing below ``least`` points."""
-    own, true = distances.to_surface, distances.to_map
+def _metrics(kind: type[_Kind], own: FloatArray, true: FloatArray, least: int, **more: Any) -> _Kind:
+    """Accuracy, completeness and F-scores of distances from the map and to it, missing below ``least`` points."""
     no_map = (_NO_MAP if least == 1 else _FEW) if len(own) < least else None
     no_surface = (_NO_SURFACE if least == 1 else _FEW) if len(true) < least else None
     precision = {key: no_map or _share(own <= within) for key, within in F_SCORES_M.items()}
@@ -234,11 +225,9 @@ def _sampled(points: FloatArray, candidates: Indices) -> Indices:
 def _surface_along(
     truth: SurfaceTruth, views: Indices, T_world_camera: FloatArray, cameras: cKDTree, stretch: Indices
 ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray, FloatArray]:
-    """The true surface around a stretch, from these views.
+    """The true surface around a stretch, from these views, as the function from points ``(P, 3)`` to their distances.
 
-    Returns:
-        distances ``(P,)`` of points ``(P, 3)`` to it, samples ``(S, 3)`` of what images show of it whose nearest camera
-        is on the stretch, and that distance ``(S,)``.
+    With it samples ``(S, 3)`` of what images show of it whose nearest camera is on the stretch, and that distance.
     """
     surface = accumulated(truth, views, T_world_camera[stretch, :3, 3])
     samples = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]
@@ -263,13 +252,6 @@ def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:
         return np.full(len(samples), np.inf)
     distances: FloatArray = cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0]
     return distances
-
-
-def _together(parts: list[MapDistances]) -> MapDistances:
-    def all_of(name: str) -> np.ndarray[Any, Any]:
-        return np.concatenate([getattr(each, name) for each in parts])
-
-    return MapDistances(*(all_of(each.name) for each in fields(MapDistances)))
 
 
 def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) -> float:

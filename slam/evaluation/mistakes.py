@@ -43,15 +43,15 @@ def _transposed(T_world_camera: FloatArray) -> FloatArray:
     return se3.make(np.swapaxes(T_world_camera[:, :3, :3], 1, 2), T_world_camera[:, :3, 3])
 
 
-_OF_POSITIONS: dict[str, Change] = {
-    "is one of the two T_camera_world? With the estimate inverted it": se3.invert,
-    "is one of the two in reverse order of time? Turned round, the estimate": lambda T: T[::-1],
-    "is the frame of one left-handed? Mirrored, the estimate": _mirrored,
-}
-_OF_ROTATIONS: dict[str, Change] = {
-    "are the quaternions of the estimate w x y z, where TUM has x y z w? Reordered, it": _requaternioned,
-    "are the rotations of one those of the world in the camera? Transposed, the estimate": _transposed,
-}
+_OF_POSITIONS: tuple[tuple[str, Change], ...] = (
+    ("is one of the two T_camera_world? With the estimate inverted it", se3.invert),
+    ("is one of the two in reverse order of time? Turned round, the estimate", lambda T: T[::-1]),
+    ("is the frame of one left-handed? Mirrored, the estimate", _mirrored),
+)
+_OF_ROTATIONS: tuple[tuple[str, Change], ...] = (
+    ("are the quaternions of the estimate w x y z, where TUM has x y z w? Reordered, it", _requaternioned),
+    ("are the rotations of one those of the world in the camera? Transposed, the estimate", _transposed),
+)
 
 
 def likely_mistakes(estimate: Trajectory, reference: Trajectory, pair: tuple[Trajectory, Trajectory]) -> list[str]:
@@ -62,17 +62,17 @@ def likely_mistakes(estimate: Trajectory, reference: Trajectory, pair: tuple[Tra
         reference: the whole truth.
         pair: the rows of both that belong together (`slam.formats.trajectory.associate`).
     """
-    T_estimate, T_reference = (each.T_world_camera for each in pair)
+    every = max(len(pair[0]) // _MOST_POSES, 1)
+    T_estimate, T_reference = (each.T_world_camera[::every] for each in pair)
     extent = float(np.std(T_reference[:, :3, 3], axis=0).max())
     if len(T_reference) < _LEAST_POSES or not extent > 0:
         return []
-    as_given = _ate(T_estimate, T_reference)
-    fits = [(_ate(change(T_estimate), T_reference), words) for words, change in _OF_POSITIONS.items()]
+    as_given = _ate(T_estimate[:, :3, 3], T_reference[:, :3, 3])
+    fits = [(_ate(change(T_estimate)[:, :3, 3], T_reference[:, :3, 3]), words) for words, change in _OF_POSITIONS]
     best, words = min(fits)
     if estimate.timed == reference.timed:
         shift, unshifted, shifted = _clock(estimate, reference)
-        has_all_rows = len(estimate) == len(reference)
-        rowwise = _ate(estimate.T_world_camera, reference.T_world_camera) if has_all_rows else np.inf
+        rowwise = _ate(estimate.positions, reference.positions) if len(estimate) == len(reference) else np.inf
         if rowwise * _BETTER < unshifted and rowwise * _BETTER_THAN_SHIFT < shifted and rowwise < best:
             return [_said("does the clock of one run faster? Row by row, the estimate", unshifted, rowwise)]
         if shifted * _BETTER < unshifted and shifted < best:
@@ -87,13 +87,8 @@ def _said(words: str, before: float, after: float, unit: str = "m") -> str:
     return f"{words} fits {before / max(after, 1e-12):.0f} times better ({after:.3g} {unit}, {before:.3g} as given)"
 
 
-def _ate(T_estimate: FloatArray, T_reference: FloatArray) -> float:
-    """7-dof, in the reference's unit, of at most some hundred poses."""
-    every = max(len(T_reference) // _MOST_POSES, 1)
-    return _residual(T_estimate[::every, :3, 3], T_reference[::every, :3, 3])
-
-
-def _residual(estimate: FloatArray, reference: FloatArray) -> float:
+def _ate(estimate: FloatArray, reference: FloatArray) -> float:
+    """Error of positions ``(N, 3)`` at 7 dof, in the reference's unit."""
     fit = se3.umeyama(reference, estimate, with_scale=True)
     moved = fit.scale * estimate @ fit.R_a_b.T + fit.t_a_b
     return float(np.sqrt(((moved - reference) ** 2).sum(axis=1).mean()))
@@ -111,7 +106,7 @@ def _clock(estimate: Trajectory, reference: Trajectory) -> tuple[float, float, f
         if inside.sum() < max(_LEAST_OVERLAP * len(times), _LEAST_POSES):
             return unmatched
         truth = [np.interp(times[inside], reference.stamps, reference.positions[:, axis]) for axis in range(3)]
-        return _residual(positions[inside], np.column_stack(truth))
+        return _ate(positions[inside], np.column_stack(truth))
 
     most = min(_LONGEST_SHIFT_S, stamps[-1] - stamps[0])
     step = max(float(np.median(np.diff(estimate.stamps))), most / _MOST_SHIFTS)
@@ -132,29 +127,24 @@ def _units(T_estimate: FloatArray, T_reference: FloatArray) -> list[str]:
 
 def _rotations(T_estimate: FloatArray, T_reference: FloatArray) -> list[str]:
     """What makes the motions of the camera between rows turn as those of the reference."""
-    turns_reference = _turns(T_reference)
-    as_given = _turn_error(_turns(T_estimate), turns_reference)
-    fits = [
-        (_turn_error(_turns(change(T_estimate)), turns_reference), words) for words, change in _OF_ROTATIONS.items()
-    ]
-    axes, _ = Rotation.align_vectors(turns_reference, _turns(T_estimate))
-    if axes.magnitude() > np.deg2rad(_LEAST_TURN_DEG):
-        words = (
-            f"have the two other axes of the camera? Turned by {np.rad2deg(axes.magnitude()):.0f} degrees, the estimate"
-        )
-        fits.append((_turn_error(axes.apply(_turns(T_estimate)), turns_reference), words))
-    best, words = min(fits)
+
+    def error(turns: FloatArray) -> float:
+        return float(np.sqrt(((turns - truth) ** 2).sum(axis=1).mean()))
+
+    truth, turns = _turns(T_reference), _turns(T_estimate)
+    fits = [(error(_turns(change(T_estimate))), words) for words, change in _OF_ROTATIONS]
+    axes, _ = Rotation.align_vectors(truth, turns)
+    between_deg = np.rad2deg(axes.magnitude())
+    if between_deg > _LEAST_TURN_DEG:
+        words = f"have the two other axes of the camera? Turned by {between_deg:.0f} degrees, the estimate"
+        fits.append((error(axes.apply(turns)), words))
+    (best, words), as_given = min(fits), error(turns)
     if as_given > np.deg2rad(_LEAST_ERROR_DEG) and best * _BETTER < as_given:
         return [_said(words, float(np.rad2deg(as_given)), float(np.rad2deg(best)), "deg a step")]
     return []
 
 
 def _turns(T_world_camera: FloatArray) -> FloatArray:
-    """Rotation vectors ``(M, 3)`` of the camera over some rows, in its own axes."""
-    apart = max(len(T_world_camera) // _MOST_POSES, 1)
-    R = T_world_camera[::apart, :3, :3]
+    """Rotation vectors ``(N - 1, 3)`` of the camera from row to row, in its own axes."""
+    R = T_world_camera[:, :3, :3]
     return np.asarray(Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec())
-
-
-def _turn_error(turns: FloatArray, reference: FloatArray) -> float:
-    return float(np.sqrt(((turns - reference) ** 2).sum(axis=1).mean()))

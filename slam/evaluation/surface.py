@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slam.frames import Mask
-from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
+from slam.geometry.se3 import FloatArray, path_distance
 
 RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
 STRETCH_M = 100.0
@@ -23,14 +23,13 @@ MOST_STRETCHES = 5
 TRUTH_VOXEL_M = 0.05
 SAMPLE_VOXEL_M = 0.2
 VIEW_STEP_M = 1.0
+VIEW_STEP_DEG = 5.0
 SPARSE_VIEW_STEP_M = 3.0  # where views do not measure the accuracy
 
 _BEYOND_M = 5.0  # of the range of map points: a wrong one may be nearest to surface out there
-_WAITING_POINTS = 500_000
-_VIEW_STEP_DEG = 5.0
+_WAITING_POINTS = 2_000_000
 _NEAR_TRUTH_M = 5.0  # of a camera to the nearest one that measured the surface
 _KEY_BITS = 21  # a coordinate in voxels, both signs
-_OFFSET = np.dtype("V12")  # three float32 as one, which are inserted six times faster
 
 Indices = NDArray[np.int64]
 
@@ -63,16 +62,11 @@ class SurfaceTruth(Protocol):
 
 def thinned(points: FloatArray, voxel_m: float, order: Indices) -> Indices:
     """Of the points ``(P, 3)`` in each voxel the one that comes first in an order ``(P,)``: their indices."""
-    first: Indices = order[np.unique(_voxel_keys(points, voxel_m)[order], return_index=True)[1]]
-    return first
-
-
-def _voxel_keys(points: FloatArray, voxel_m: float) -> Indices:
-    """The voxel of each point ``(P, 3)`` as one number."""
     key = np.zeros(len(points), dtype=np.int64)
     for axis in points.T:  # one at a time, for there are millions
         key = (key << _KEY_BITS) | (np.floor(axis / voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1)))
-    return key
+    first: Indices = order[np.unique(key[order], return_index=True)[1]]
+    return first
 
 
 def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices]:
@@ -100,20 +94,6 @@ def length_m(T_world_camera: FloatArray, parts: list[Indices]) -> float:
     return float(sum(to_next[part].sum() for part in parts))
 
 
-def moved_frames(T_world_camera: FloatArray, frames: Indices, step_m: float) -> Indices:
-    """The increasing ``frames`` that are ``step_m`` or 5 degrees from the chosen one before."""
-    kept: list[int] = []
-    for frame in frames:
-        if kept:
-            T_last, T_next = T_world_camera[kept[-1]], T_world_camera[frame]
-            moved = float(np.linalg.norm(T_next[:3, 3] - T_last[:3, 3]))
-            turned = float(rotation_angle(T_last[:3, :3].T @ T_next[:3, :3]))
-            if moved < step_m and turned < np.deg2rad(_VIEW_STEP_DEG):
-                continue
-        kept.append(int(frame))
-    return np.array(kept, dtype=np.int64)
-
-
 def nearby(T_world_camera: FloatArray, views: Indices, part: Indices) -> Indices:
     """The ``views`` that can see surfaces near a stretch of road."""
     positions = T_world_camera[:, :3, 3]
@@ -129,56 +109,18 @@ def accumulated(truth: SurfaceTruth, views: Indices, positions: FloatArray) -> S
     """
     margin = RANGE_M + _BEYOND_M
     low, high = positions.min(axis=0) - margin, positions.max(axis=0) + margin
-    voxels = _SurfaceVoxels(low)
-    for frame in views:
-        voxels.add(_cropped(truth.view(int(frame)), low, high))
-    return voxels.surface()
-
-
-def _cropped(surface: Surface, low: FloatArray, high: FloatArray) -> Surface:
-    inside = ((surface.points >= low) & (surface.points <= high)).all(axis=1)
-    return Surface(surface.points[inside], surface.in_image[inside])
-
-
-class _SurfaceVoxels:
-    """A surface as one point in each voxel of 5 cm, the first in an image where there is one; 21 bytes a voxel."""
-
-    def __init__(self, origin: FloatArray) -> None:
-        """Nothing yet; points are kept as offsets from a point ``(3,)`` near them."""
-        self._origin = origin
-        self._keys: Indices = np.empty(0, dtype=np.int64)  # increasing
-        self._offsets: NDArray[np.void] = np.empty(0, dtype=_OFFSET)
-        self._in_image: Mask = np.empty(0, dtype=bool)
-        self._waiting: list[Surface] = []
-
-    def add(self, view: Surface) -> None:
-        """Add a view, together with the next ones, for new voxels move all others."""
-        self._waiting.append(view)
-        if sum(len(each.points) for each in self._waiting) > _WAITING_POINTS:
-            self._insert_waiting()
-
-    def surface(self) -> Surface:
-        """All that was added."""
-        self._insert_waiting()
-        return Surface(self._offsets.view(np.float32).reshape(-1, 3) + self._origin, self._in_image)
-
-    def _insert_waiting(self) -> None:
-        points = np.concatenate([np.empty((0, 3)), *(view.points for view in self._waiting)])
-        in_image = np.concatenate([np.empty(0, dtype=bool), *(view.in_image for view in self._waiting)])
-        self._waiting = []
-        chosen = thinned(points, TRUTH_VOXEL_M, np.argsort(~in_image, kind="stable"))
-        keys = _voxel_keys(points[chosen], TRUTH_VOXEL_M)
-        offsets = (points[chosen] - self._origin).astype(np.float32).view(_OFFSET).ravel()
-        in_image = in_image[chosen]
-        place = np.searchsorted(self._keys, keys)
-        is_new = np.append(self._keys, -1)[place] != keys
-        better = ~is_new & in_image
-        better[better] = ~self._in_image[place[better]]
-        self._offsets[place[better]] = offsets[better]
-        self._in_image[place[better]] = True
-        self._keys = np.insert(self._keys, place[is_new], keys[is_new])
-        self._offsets = np.insert(self._offsets, place[is_new], offsets[is_new])
-        self._in_image = np.insert(self._in_image, place[is_new], in_image[is_new])
+    surface = Surface(np.empty((0, 3)), np.empty(0, dtype=bool))
+    waiting: list[Surface] = []
+    for number, frame in enumerate(views, 1):
+        view = truth.view(int(frame))
+        inside = ((view.points >= low) & (view.points <= high)).all(axis=1)
+        waiting.append(Surface(view.points[inside], view.in_image[inside]))
+        if number == len(views) or sum(len(each.points) for each in waiting) > _WAITING_POINTS:
+            points = np.concatenate([surface.points, *(each.points for each in waiting)])
+            in_image = np.concatenate([surface.in_image, *(each.in_image for each in waiting)])
+            chosen = thinned(points, TRUTH_VOXEL_M, np.argsort(~in_image, kind="stable"))
+            surface, waiting = Surface(points[chosen], in_image[chosen]), []
+    return surface
 
 
 def backprojected(depth_m: FloatArray, rays: FloatArray, T_world_camera: FloatArray, range_m: float) -> FloatArray:

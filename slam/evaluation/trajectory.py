@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
-from slam.evaluation.drift import KITTI_LENGTHS_M, relative_errors, segment_errors
+from slam.evaluation.drift import KITTI_LENGTHS_M, SegmentErrors, relative_errors, segment_errors
 from slam.formats.trajectory import (
     Trajectory,
     associate,
@@ -55,15 +56,64 @@ class SnippetMetrics(Record):
     count: Count | None = None
 
 
-class AlignedMetrics(Record):
-    """The object A of ``metrics.json``: errors under one alignment."""
+@dataclass(frozen=True)
+class Aligned:
+    """An estimate brought to a reference, both ``(N, 4, 4)`` and with one world."""
 
-    ate_rmse_m: float | None = None
-    t_rel_percent: float | None = None
-    r_rel_deg_per_100m: float | None = None
-    rpe_trans_m: float | None = None
-    rpe_rot_deg: float | None = None
-    scale: float | None = None
+    T_world_estimate: FloatArray
+    T_world_reference: FloatArray
+    scale: float | Failed
+
+    @cached_property
+    def step_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Translation (metres) and rotation (radians) errors ``(N - 1,)`` from each frame to the next."""
+        first = np.arange(len(self.T_world_estimate) - 1)
+        return relative_errors(self.T_world_estimate, self.T_world_reference, first, first + 1)
+
+    def drift(self, errors_per_m: Callable[[SegmentErrors], FloatArray]) -> float | Failed:
+        """KITTI's drift: the mean over all segments of 100 to 800 m of true path."""
+        segments = segment_errors(self.T_world_estimate, self.T_world_reference, KITTI_LENGTHS_M)
+        if not segments:
+            path_m = se3.path_distance(self.T_world_reference)[-1]
+            return Failed(f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m")
+        return float(np.concatenate([errors_per_m(each) for each in segments]).mean())
+
+
+class Statistic(NamedTuple):
+    """A number under an alignment: its header with the unit, its decimals in tables, and its formula."""
+
+    header: str
+    decimals: int
+    formula: Callable[[Aligned], float | Failed]
+
+
+def _ate(pair: Aligned) -> float:
+    offsets = pair.T_world_estimate[:, :3, 3] - pair.T_world_reference[:, :3, 3]
+    return float(np.sqrt((offsets**2).sum(axis=1).mean()))
+
+
+_T_REL = Statistic("t_rel\n%", 2, lambda pair: pair.drift(lambda each: 100.0 * each.translation_m / each.length_m))
+_R_REL = Statistic(
+    "r_rel\ndeg/100m", 3, lambda pair: pair.drift(lambda each: 100.0 * np.rad2deg(each.rotation) / each.length_m)
+)
+_RPE_M = Statistic("RPE\nm", 4, lambda pair: float(pair.step_errors[0].mean()))
+_RPE_DEG = Statistic("RPE\ndeg", 4, lambda pair: float(np.rad2deg(pair.step_errors[1].mean())))
+
+
+class AlignedMetrics(Record):
+    """The object A of ``metrics.json``: errors under one alignment. A metric is a field with its `Statistic`."""
+
+    ate_rmse_m: Annotated[float | None, Statistic("ATE\nm", 3, _ate)] = None
+    t_rel_percent: Annotated[float | None, _T_REL] = None
+    r_rel_deg_per_100m: Annotated[float | None, _R_REL] = None
+    rpe_trans_m: Annotated[float | None, _RPE_M] = None
+    rpe_rot_deg: Annotated[float | None, _RPE_DEG] = None
+    scale: Annotated[float | None, Statistic("scale", 4, lambda pair: pair.scale)] = None
+
+    @classmethod
+    def statistics(cls) -> dict[str, Statistic]:
+        """Of every number, by its key."""
+        return {name: cls.model_fields[name].metadata[0] for name in cls.names()}
 
 
 class Alignments(Record):
@@ -91,15 +141,6 @@ class TrajectoryMetrics(Record):
     snippet5: SnippetMetrics = part(SnippetMetrics)
     align: Alignments = part(Alignments)
     evo: EvoMetrics = part(EvoMetrics)
-
-
-@dataclass(frozen=True)
-class Aligned:
-    """An estimate brought to a reference, both ``(N, 4, 4)`` and with one world."""
-
-    T_world_estimate: FloatArray
-    T_world_reference: FloatArray
-    scale: float | Failed
 
 
 def trajectory_metrics(
@@ -243,37 +284,7 @@ def _alignment_metrics(
     aligned = align(T_world_estimate, T_world_reference, alignment)
     if not isinstance(aligned.scale, Failed) and aligned.scale <= 0:
         return AlignedMetrics.unknown(_BACKWARDS.reason)
-    offsets = aligned.T_world_estimate[:, :3, 3] - aligned.T_world_reference[:, :3, 3]
-    return AlignedMetrics.of(
-        ate_rmse_m=float(np.sqrt((offsets**2).sum(axis=1).mean())),
-        **_segment_metrics(aligned.T_world_estimate, aligned.T_world_reference),
-        **_step_metrics(aligned.T_world_estimate, aligned.T_world_reference),
-        scale=aligned.scale,
-    )
-
-
-def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Failed]:
-    """KITTI's drift: the mean over all segments of 100 to 800 m of true path."""
-    segments = segment_errors(T_world_estimate, T_world_reference, KITTI_LENGTHS_M)
-    if not segments:
-        path_m = se3.path_distance(T_world_reference)[-1]
-        none = Failed(f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m")
-        return {"t_rel_percent": none, "r_rel_deg_per_100m": none}
-    translation = np.concatenate([each.translation_m / each.length_m for each in segments])
-    rotation = np.concatenate([each.rotation / each.length_m for each in segments])
-    return {
-        "t_rel_percent": float(100.0 * translation.mean()),
-        "r_rel_deg_per_100m": float(100.0 * np.rad2deg(rotation).mean()),
-    }
-
-
-def _step_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Failed]:
-    """Mean error from each frame to the next."""
-    first = np.arange(len(T_world_estimate) - 1)
-    if not first.size:
-        return dict.fromkeys(("rpe_trans_m", "rpe_rot_deg"), Failed("a single frame makes no step"))
-    translation, rotation = relative_errors(T_world_estimate, T_world_reference, first, first + 1)
-    return {"rpe_trans_m": float(translation.mean()), "rpe_rot_deg": float(np.rad2deg(rotation).mean())}
+    return AlignedMetrics.of(**{name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()})
 
 
 def _cut_snippets(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> SnippetErrors | None:
@@ -304,12 +315,10 @@ def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ou
     """The statistics of ``7dof`` again, computed by evo alone, and the largest disagreement with ours."""
     if ours.ate_rmse_m is None:
         return EvoMetrics.unknown(ours.why("ate_rmse_m"))
-    try:
-        from evo import EvoException
-        from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
-        from evo.core.trajectory import PosePath3D
-    except ImportError as error:
-        return EvoMetrics.unknown(f"evo cannot be imported ({error})")
+    from evo import EvoException
+    from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
+    from evo.core.trajectory import PosePath3D
+
     estimate, reference = PosePath3D(poses_se3=[*T_world_estimate]), PosePath3D(poses_se3=[*T_world_reference])
     values = {}
     try:

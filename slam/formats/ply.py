@@ -81,21 +81,6 @@ def read_ply(path: Path) -> Ply:
         raise RunError(f"{path} is no PLY that can be read ({error}): run the sequence again") from error
 
 
-def map_ply(path: Path) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    """Vertices ``(V,)`` and triangles ``(T,)`` of a binary mesh, mapped into memory and not checked.
-
-    Returns:
-        Structured arrays; the field ``vertices`` of a triangle has its three corners.
-
-    Raises:
-        RunError: it is no binary mesh, or is shorter or longer than it states.
-    """
-    parts = _mapped(path)
-    if "face" not in parts:
-        raise RunError(f"{path} is no mesh: run the sequence again")
-    return parts["vertex"], parts["face"]
-
-
 def _mapped(path: Path) -> dict[str, NDArray[np.void]]:
     """The elements by name, vertices among them."""
     parts: dict[str, NDArray[np.void]] = {}

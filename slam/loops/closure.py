@@ -48,48 +48,20 @@ class LoopClosures:
         kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
         return replace(self, accepted=kept, rejected=gone + self.rejected)
 
-    def summary(self) -> dict[str, Any]:
-        """For ``metrics.json``: the numbers, and the reasons of the rejected loops with most inliers."""
-        if self.not_sought is not None:
-            names = ("candidates", "verified", "accepted")
-            absent = dict.fromkeys(names) | {f"{name}_reason": self.not_sought for name in names}
-            return {**absent, "rejected": []}
-        return {
-            "candidates": self.candidates,
-            "verified": self.verified,
-            "accepted": len(self.accepted),
-            "rejected": [
-                {"from": loop.from_index, "to": loop.to_index, "reason": loop.reason}
-                for loop in self.rejected[:MOST_REJECTED]
-            ],
-        }
-
     def details(self) -> dict[str, Any]:
-        """For ``loops.json``: every accepted loop and the rejected ones with most inliers, with their measurements."""
-        return {
-            "accepted": [
-                {
-                    **_entry(*loop.ends, loop.inliers, loop.score),
-                    "reason": f"{loop.inliers} inliers in both directions",
-                    "T_from_to": loop.measured.T_from_to.tolist(),
-                    "sigmas": loop.measured.sigmas.tolist(),
-                }
-                for loop in self.accepted
-            ],
-            "rejected": [
-                {
-                    **_entry(loop.from_index, loop.to_index, loop.inliers, loop.score),
-                    "reason": loop.reason,
-                    "T_from_to": None if loop.T_from_to is None else loop.T_from_to.tolist(),
-                }
-                for loop in self.rejected[:MOST_REJECTED]
-            ],
-            "rejected_left_out": max(len(self.rejected) - MOST_REJECTED, 0),
-        }
+        """For ``loops.json``: every accepted loop with its measurement, and the rejected ones with most inliers."""
 
+        def entry(ends: tuple[int, int], loop: Loop | RejectedLoop, **more: Any) -> dict[str, Any]:
+            return {"from": ends[0], "to": ends[1], "inliers": loop.inliers, "score": round(loop.score, 4), **more}
 
-def _entry(from_index: int, to_index: int, inliers: int, score: float) -> dict[str, Any]:
-    return {"from": from_index, "to": to_index, "inliers": inliers, "score": round(score, 4)}
+        accepted = []
+        for loop in self.accepted:
+            reason, measured = f"{loop.inliers} inliers in both directions", loop.measured
+            measurement = {"T_from_to": measured.T_from_to.tolist(), "sigmas": measured.sigmas.tolist()}
+            accepted.append(entry(loop.ends, loop, reason=reason, **measurement))
+        rejected = [entry((loop.from_index, loop.to_index), loop, reason=loop.reason) for loop in self.rejected]
+        more = max(len(rejected) - MOST_REJECTED, 0)
+        return {"accepted": accepted, "rejected": rejected[:MOST_REJECTED], "rejected_left_out": more}
 
 
 def close_loops(
@@ -126,11 +98,8 @@ def close_loops(
 def find_loops(views: Sequence[View], track: Track, apart: Apart, verifier: LoopVerifier) -> LoopClosures:
     """Loops among the views of a track that are verified and agree with each other.
 
-    Args:
-        views: in time order, of some rows of the track, their points in the units of their maps.
-        track: the odometry.
-        apart: which views may make a loop, see `find_candidates`.
-        verifier: of candidates.
+    The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says
+    which may make a loop, see `find_candidates`.
     """
     candidates = find_candidates(views, apart, verifier.thresholds)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
@@ -162,10 +131,7 @@ def _least_path(views: Sequence[View], is_metric: bool) -> float:
 def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[Loop]:
     """The loops with the sigmas of one loop together wherever several join the same two places, of a car that waits.
 
-    Args:
-        loops: that are accepted.
-        path: distance driven up to each frame ``(N,)``.
-        near: along it, within which two frames show the same place with the same errors.
+    Two frames less than ``near`` apart along the ``path`` ``(N,)`` show the same place with the same errors.
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)

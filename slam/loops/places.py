@@ -4,27 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from erfsfm.common.readers.pinhole import Pinhole, impossible
 from slam.frames import Intrinsics, View
-from slam.geometry.se3 import FloatArray, is_se3
+from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
 
 _FORMAT = 1
-# kind and shape of each array, for V views and M corners
-_ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
-    "camera": ("f", (6,)),
-    "frames": ("i", ("V",)),
-    "counts": ("i", ("V",)),
-    "T_world_camera": ("f", ("V", 4, 4)),
-    "pixels": ("f", ("M", 2)),
-    "descriptors": ("u", ("M", 32)),
-    "points": ("f", ("M", 3)),
-}
+_ARRAYS = ("camera", "frames", "counts", "T_world_camera", "pixels", "descriptors", "points")
 
 
 @dataclass(frozen=True)
@@ -64,7 +53,6 @@ class Places:
                 undistorted = "undistorted" in file and bool(file["undistorted"])
             if int(content["format"]) != _FORMAT:
                 raise RunError(f"{path} has format {content['format']}, this version reads {_FORMAT}: run again")
-            _check(content)
         except FileNotFoundError as error:
             raise RunError(f"{path} is missing: run the sequence again") from error
         except RunError:
@@ -80,23 +68,3 @@ class Places:
         views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
         camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
         return cls(camera, views, content["T_world_camera"])
-
-
-def _check(content: dict[str, NDArray[Any]]) -> None:
-    """Refuse arrays that do not belong together, with a ``ValueError``."""
-    sizes: dict[int | str, int] = {"V": len(content["frames"]), "M": int(content["counts"].sum())}
-    for name, (kind, shape) in _ARRAYS.items():
-        array, expected = content[name], tuple(sizes.get(side, side) for side in shape)
-        if array.dtype.kind != kind or array.shape != expected:
-            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {expected}")
-    if (content["counts"] < 0).any() or (np.diff(content["frames"], prepend=-1) <= 0).any():
-        raise ValueError("frames do not increase, or a count is negative")
-    T_world_camera = content["T_world_camera"]
-    if len(T_world_camera) and not is_se3(T_world_camera, tolerance=1e-5):
-        raise ValueError("a pose is no rigid transform")
-    if not np.isfinite(content["pixels"]).all() or np.isinf(content["points"]).any():
-        raise ValueError("a pixel or a point is not finite")
-    width, height, *pinhole = content["camera"].tolist()
-    problem = impossible(Pinhole(int(width), int(height), *pinhole))
-    if problem is not None:
-        raise ValueError(problem)

@@ -39,21 +39,8 @@ class Relocalised:
 class Relocaliser:
     """Finds single images among the keyframes of one map."""
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        T_map_camera: FloatArray,
-        intrinsics: Intrinsics,
-        seed: int = 0,
-    ) -> None:
-        """Index the keyframes.
-
-        Args:
-            views: of the keyframes, at least one, with points in the unit of the map.
-            T_map_camera: of the keyframes ``(V, 4, 4)``.
-            intrinsics: of all images.
-            seed: of RANSAC.
-        """
+    def __init__(self, views: Sequence[View], T_map_camera: FloatArray, intrinsics: Intrinsics, seed: int = 0) -> None:
+        """Index keyframes, at least one, with points in the unit of the map and poses ``(V, 4, 4)``."""
         self._views, self._T_map_camera, self._intrinsics = views, T_map_camera, intrinsics
         self._index = PlaceIndex(views)
         self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)

@@ -7,7 +7,7 @@ few enough frames for it, and words trained on its own images discriminate bette
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ _WORDS = 1000  # size of the binary vocabulary learned on the run
 Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 
 
-@dataclass(frozen=True)
-class Candidate:
+class Candidate(NamedTuple):
     """Two similar views by their rows; ``score`` is their similarity over that of neighbouring frames."""
 
     earlier: int
@@ -67,8 +66,9 @@ class PlaceIndex:
         """Train the vocabulary on the drive's views, at least one."""
         everything = np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
         self._words = train_vocabulary(everything, _WORDS)
-        counts = _word_counts(views, nearest_words(everything, self._words), _WORDS)
-        self._inverse_frequency = _inverse_frequency(counts)
+        counts = _word_counts(views, nearest_words(everything, self._words))
+        seen_in = np.bincount(counts.indices, minlength=_WORDS)
+        self._inverse_frequency: FloatArray = np.log(len(views) / np.maximum(seen_in, 1))
         self.weights = _weighted(counts, self._inverse_frequency)
 
     def nearest(self, view: View, count: int) -> list[int]:
@@ -76,7 +76,7 @@ class PlaceIndex:
         if not len(self._words) or not len(view):
             return []
         word = nearest_words(view.descriptors, self._words)
-        query = _weighted(_word_counts([view], word, len(self._inverse_frequency)), self._inverse_frequency)
+        query = _weighted(_word_counts([view], word), self._inverse_frequency)
         scores = (self.weights @ query.T).toarray().ravel()
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(row) for row in best if scores[row] > 0]
@@ -104,19 +104,12 @@ def nearest_words(descriptors: Descriptors, words: Descriptors) -> NDArray[np.in
     return np.concatenate([np.zeros(0, np.int64), *nearest])
 
 
-def _word_counts(views: Sequence[View], word: NDArray[np.int64], words: int) -> csr_array:
+def _word_counts(views: Sequence[View], word: NDArray[np.int64]) -> csr_array:
     """Counts ``(V, words)`` of each word in each view; ``word`` is of all descriptors, view after view."""
     row = np.repeat(np.arange(len(views)), [len(view) for view in views])
-    counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), words))
+    counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), _WORDS))
     counts.sum_duplicates()
     return counts
-
-
-def _inverse_frequency(counts: csr_array) -> FloatArray:
-    """Inverse document frequency ``(K,)`` of each word."""
-    seen_in = np.bincount(counts.indices, minlength=counts.shape[1])
-    weight: FloatArray = np.log(counts.shape[0] / np.maximum(seen_in, 1))
-    return weight
 
 
 def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:

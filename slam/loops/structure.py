@@ -103,11 +103,7 @@ class PlaceStructure:
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:
         """Points ``(count, 3)``, NaN where unknown, and the sightings that agree with them.
 
-        Args:
-            views: of each sighting the place ``(S,)``.
-            corners: its row there ``(S,)``.
-            point: which point it is of ``(S,)``.
-            count: points.
+        A sighting is of a ``point``, at a row of the ``corners`` of a place among the ``views``, ``(S,)`` each.
         """
         intrinsics, allowed_px = self._places.intrinsics, self._thresholds.reprojection_px
         rays, focal = intrinsics.rays(self.pixels(views, corners)), (intrinsics.fx, intrinsics.fy)

@@ -27,45 +27,25 @@ _LEAST_SCALES = 8  # corners with points in both views, which give the ratio of 
 
 @dataclass(frozen=True)
 class LoopThresholds:
-    """Independent of scale: pixels, ratios, degrees. Distances and drift of support are by frames or by keyframes.
+    """Independent of scale: pixels, ratios, degrees. Distances and drift of support are by frames or by keyframes."""
 
-    Attributes:
-        min_inliers: least number of inliers in each direction.
-        agreement_deg: largest difference of the rotations measured in both directions.
-        agreement_ratio: largest difference of the translations measured in both directions, over the depth.
-        min_support: least number of images with loops nearby that agree.
-        candidates: largest number of places verified for a view.
-        candidate_spacing: least distance between these, frames.
-        least_score: least similarity of a candidate, over that of neighbouring views.
-        max_hamming: largest Hamming distance of matching descriptors, bits.
-        reprojection_px: largest reprojection error of an inlier.
-        min_inlier_ratio: among the matches with depth.
-        max_drift_ratio: largest correction over the path between both ends.
-        support_distance: of both ends, within which loops must agree.
-        support_drift_deg: rotation drift of the odometry between supporting loops, per frame or keyframe.
-        alone_inliers: number of inliers from which on a loop needs no support.
-        rotation_floor_deg: least rotation sigma.
-        translation_floor_ratio: least translation sigma over the depth.
-        has_units: whether the points of both views may have different units.
-    """
-
-    min_inliers: int = 20
-    agreement_deg: float = 2.0
-    agreement_ratio: float = 0.1
-    min_support: int = 2
-    candidates: int = 2
-    candidate_spacing: int = 10
-    least_score: float = 0.2
-    max_hamming: int = 64
-    reprojection_px: float = 3.0
-    min_inlier_ratio: float = 0.4
-    max_drift_ratio: float = 0.3
-    support_distance: int = 20
-    support_drift_deg: float = 0.1
-    alone_inliers: int = 120
-    rotation_floor_deg: float = 0.02
-    translation_floor_ratio: float = 0.0003
-    has_units: bool = False
+    min_inliers: int = 20  # in each direction
+    agreement_deg: float = 2.0  # of the rotations measured in both directions
+    agreement_ratio: float = 0.1  # of the translations, over the depth
+    min_support: int = 2  # images with loops nearby that agree
+    candidates: int = 2  # places verified for a view
+    candidate_spacing: int = 10  # between these, frames
+    least_score: float = 0.2  # similarity of a candidate, over that of neighbouring views
+    max_hamming: int = 64  # bits between matching descriptors
+    reprojection_px: float = 3.0  # of an inlier
+    min_inlier_ratio: float = 0.4  # among the matches with depth
+    max_drift_ratio: float = 0.3  # correction over the path between both ends
+    support_distance: int = 20  # of both ends, within which loops must agree
+    support_drift_deg: float = 0.1  # rotation drift of the odometry between supporting loops, per frame or keyframe
+    alone_inliers: int = 120  # from which on a loop needs no support
+    rotation_floor_deg: float = 0.02  # of the sigmas
+    translation_floor_ratio: float = 0.0003  # of the sigmas, over the depth
+    has_units: bool = False  # the points of both views may have different units
 
 
 OF_FRAMES = LoopThresholds()
@@ -95,7 +75,7 @@ class Loop:
     """A verified loop; ``inliers`` is the smaller of both directions.
 
     ``measured`` is in the unit of the earlier view, ``scale`` that of the later one in it. ``corners`` ``(M, 2)`` are
-    rows of corners of the earlier and of the later view that show one point.
+    rows of corners of the earlier and of the later view that show one point, ``pixels`` ``(M, 2, 2)`` where they are.
     """
 
     measured: RelativePose
@@ -103,6 +83,7 @@ class Loop:
     score: float
     scale: float = 1.0
     corners: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
+    pixels: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 2), np.float32))
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -115,25 +96,18 @@ class Loop:
 
     def refused(self, reason: str) -> RejectedLoop:
         """The same loop, rejected for a reason."""
-        return RejectedLoop(*self.ends, reason, self.score, self.inliers, self.measured.T_from_to)
+        return RejectedLoop(*self.ends, reason, self.score, self.inliers)
 
 
 @dataclass(frozen=True)
 class RejectedLoop:
-    """A rejected candidate or loop, with what was measured of it."""
+    """A rejected candidate or loop."""
 
     from_index: int
     to_index: int
     reason: str
     score: float
     inliers: int = 0
-    T_from_to: FloatArray | None = None
-
-    def scaled(self, scale: float) -> RejectedLoop:
-        """The same in another unit: the translation times ``scale``."""
-        if self.T_from_to is None:
-            return self
-        return replace(self, T_from_to=make(self.T_from_to[:3, :3], scale * self.T_from_to[:3, 3]))
 
 
 class Sighting(NamedTuple):
@@ -160,8 +134,8 @@ class LoopVerifier:
         """Measure the pose of the later view in the earlier one, or reject it with a reason."""
         rows_earlier, rows_later = matches(earlier, later, self.thresholds)
 
-        def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
-            return RejectedLoop(earlier.index, later.index, reason, score, inliers, T)
+        def refused(reason: str, inliers: int = 0) -> RejectedLoop:
+            return RejectedLoop(earlier.index, later.index, reason, score, inliers)
 
         if len(rows_earlier) < self.thresholds.min_inliers:
             return refused(f"only {len(rows_earlier)} matches")
@@ -170,13 +144,12 @@ class LoopVerifier:
         if isinstance(forward, str):
             return refused(forward)
         backward = self.resect(points_later, earlier.pixels[rows_earlier])
-        T_earlier_later = invert(forward.T_camera_points)
         if isinstance(backward, str):
-            return refused(f"backwards {backward}", len(forward.inliers), T_earlier_later)
+            return refused(f"backwards {backward}", len(forward.inliers))
         inliers = min(len(forward.inliers), len(backward.inliers))
         scale = _scale(points_earlier, points_later, forward, backward) if self.thresholds.has_units else 1.0
         if scale is None:
-            return refused("few corners have points in both views", inliers, T_earlier_later)
+            return refused("few corners have points in both views", inliers)
         T_again = backward.T_camera_points.copy()
         T_again[:3, 3] *= scale
         difference = forward.T_camera_points @ T_again
@@ -185,12 +158,14 @@ class LoopVerifier:
         translation_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
         if rotation_deg > self.thresholds.agreement_deg or translation_ratio > self.thresholds.agreement_ratio:
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
-            return refused(reason, inliers, T_earlier_later)
-        T_middle = _halfway(T_earlier_later, T_again)
+            return refused(reason, inliers)
+        T_middle = _halfway(invert(forward.T_camera_points), T_again)
         sigmas = self._sigmas(T_middle, depth, difference, forward.sigmas, backward.sigmas * np.repeat([1.0, scale], 3))
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         shared = np.union1d(forward.inliers, backward.inliers)
-        return Loop(measured, inliers, score, scale, np.column_stack([rows_earlier[shared], rows_later[shared]]))
+        corners = np.column_stack([rows_earlier[shared], rows_later[shared]])
+        pixels = np.stack([earlier.pixels[corners[:, 0]], later.pixels[corners[:, 1]]], axis=1)
+        return Loop(measured, inliers, score, scale, corners, pixels)
 
     def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
         """The camera that sees points ``(M, 3)``, NaN where unknown, at pixels ``(M, 2)``; or why not."""

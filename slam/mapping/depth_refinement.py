@@ -40,14 +40,9 @@ class DepthRefiner:
         image: Callable[[int], Image],
         decide: Decide,
     ) -> None:
-        """Prepare.
+        """Keyframes of these frame numbers, ascending, at poses ``(K, 4, 4)`` in the unit of the depths to come.
 
-        Args:
-            intrinsics: of the keyframes' images.
-            indices: frame numbers of the K keyframes, ascending.
-            T_world_camera: their poses ``(K, 4, 4)``, in the unit of the depths to come.
-            image: the n-th keyframe's image ``(H, W, 3)``.
-            decide: of `decision`.
+        ``image`` gives that of the n-th keyframe, of these intrinsics; ``decide`` is of `decision`.
         """
         self._intrinsics = intrinsics
         self._indices = np.asarray(indices)

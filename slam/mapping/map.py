@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +18,7 @@ from slam.geometry.se3 import FloatArray
 from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
-from slam.mapping.views import ViewChooser, has_moved
+from slam.mapping.views import ViewChooser, moved_rows
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpillFile
 
@@ -27,28 +29,12 @@ _EARLIER = 3  # views between one and that which tells what has come since
 _KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 
 
-@dataclass(frozen=True)
-class MapStatistics:
-    """Sizes of a map and its voxels, the share of pixels that each filter took, and of triangles in loose pieces."""
-
-    triangles: int
-    points: int
-    blocks: int
-    submaps: int
-    frames_fused: int
-    frames_left_out: int
-    voxel_size: float
-    filters: dict[str, float]
-    floater_share: float
-
-
 class TsdfMap:
     """TSDF fusion of depth maps along a trajectory; lengths are in the trajectory's unit."""
 
     def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
         """Prepare for depth maps and images of these ``intrinsics``."""
         self._config = config
-        self._size = (intrinsics.height, intrinsics.width)
         self._intrinsics = intrinsics
         self._filters = DepthFilters(config, intrinsics)
         self._views = ViewChooser(self._filters, config.depth_max_m)
@@ -68,11 +54,8 @@ class TsdfMap:
         Raises:
             SlamError: the disk is full.
         """
-        depth, image = keyframe.depth, keyframe.image
-        if depth.shape != self._size or image.shape != (*self._size, 3):
-            raise ValueError(f"depth and image must be {self._size}; got {depth.shape} and {image.shape}")
-        known = np.isfinite(depth) & (depth > 0)
-        known_depth = np.where(known, depth, np.float32(0)).astype(np.float32)
+        depth = keyframe.depth
+        known_depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)).astype(np.float32)
         view = replace(keyframe, depth=known_depth, network_depth=None)
         if not self._filters.trusted(view).any():
             self._left_out += 1
@@ -87,13 +70,7 @@ class TsdfMap:
             frames: frame numbers in time order.
             T_world_camera: poses of all frames ``(N, 4, 4)``.
         """
-        chosen: list[int] = []
-        step_m = self._config.keyframe_distance_m
-        for position, frame in enumerate(frames):
-            before = T_world_camera[frames[chosen[-1]]] if chosen else None
-            if before is None or has_moved(T_world_camera[frame], before, step_m, _KEYFRAME_ROTATION_DEG):
-                chosen.append(position)
-        return chosen
+        return moved_rows(T_world_camera[list(frames)], self._config.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)
 
     def surface(self, progress: Progress = silent) -> MapSurface:
         """The surface of all that was fused; more depth maps may follow.
@@ -128,16 +105,15 @@ class TsdfMap:
         """Side of a voxel, in the trajectory's unit."""
         return self._config.voxel_size_m
 
-    def statistics(self) -> MapStatistics:
-        """Counts of all that was given so far, zero for an empty map."""
+    def statistics(self) -> dict[str, Any]:
+        """Sizes of all that was given so far, zero for an empty map, and the share of pixels that each filter took."""
         self._fuse_waiting(None)
-        frames, filters = (self._fused, self._left_out), self._filters.shares()
-        try:
+        sizes = {"triangles": 0, "points": 0, "blocks": 0, "submaps": len(self._finished), "floater_share": 0.0}
+        with suppress(EmptyMapError):
             surface = self.surface()
-        except EmptyMapError:
-            return MapStatistics(0, 0, 0, len(self._finished), *frames, self.voxel_size, filters, 0.0)
-        sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
-        return MapStatistics(*sizes, *frames, self.voxel_size, filters, surface.floater_share)
+            sizes = {name: getattr(surface, name) for name in sizes}
+        frames = {"frames_fused": self._fused, "frames_left_out": self._left_out}
+        return sizes | frames | {"voxel_size": self.voxel_size, "filters": self._filters.shares()}
 
     def _fuse_waiting(self, following: KeyframeDepth | None) -> None:
         """Fuse the view that waits for the one after it."""

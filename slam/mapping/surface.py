@@ -68,13 +68,7 @@ class MapSurface:
     def __init__(
         self, finished: Sequence[SpilledSubmap], fused: int, config: MappingConfig, progress: Progress = silent
     ) -> None:
-        """Merge the submaps and extract their surface.
-
-        Args:
-            finished: the submaps.
-            fused: number of frames in them.
-            config: voxel size and how to clean.
-            progress: called with (stage, done, total).
+        """Merge the submaps of so many fused frames and extract their surface.
 
         Raises:
             EmptyMapError: nothing was fused or seen often enough.

@@ -92,6 +92,15 @@ def has_moved(T_world_camera: FloatArray, T_world_before: FloatArray, step_m: fl
     return float(np.linalg.norm(T_before_camera[:3, 3])) >= step_m or turned >= np.deg2rad(turn_deg)
 
 
+def moved_rows(T_world_camera: FloatArray, step_m: float, turn_deg: float) -> list[int]:
+    """The first of some poses ``(N, 4, 4)``, and each before which the camera has moved since the last chosen one."""
+    chosen: list[int] = []
+    for row, T_next in enumerate(T_world_camera):
+        if not chosen or has_moved(T_next, T_world_camera[chosen[-1]], step_m, turn_deg):
+            chosen.append(row)
+    return chosen
+
+
 def _grey(image: Image) -> FloatArray:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float64)
 

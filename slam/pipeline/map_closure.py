@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,7 +16,6 @@ from slam.frontend.factors import scaled_poses
 from slam.frontend.keyframes.joining import join
 from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.keyframes.unit import learned_unit
 from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, apply, invert, make, path_distance
 from slam.graph.similarity_graph import optimise_similarities
@@ -42,24 +41,18 @@ _TURN_SIGMAS = 3.0  # of a motion between parts of a map, by which a loop may co
 class MapClosure:
     """Poses by the closed maps, the ``loops`` among their keyframes, and the maps that were joined.
 
-    Lengths of loops are in the unit of their maps; ``learned_units`` is that of learned depth per unit of the map of
-    each keyframe, before maps were joined, by its frame.
+    Lengths of loops are in the unit of their maps.
     """
 
     poses: KeyframePoses
     loops: LoopClosures = field(default_factory=LoopClosures)
-    learned_units: Mapping[int, float] = field(default_factory=dict)
     joins: tuple[TrackingEvent, ...] = ()
 
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
         scaled = scaled_poses(self.poses.loops, self.poses, scale)
         accepted = [replace(loop, measured=pose) for pose, loop in zip(scaled, self.loops.accepted, strict=True)]
-        rejected = [
-            loop.scaled(self.learned_units[loop.from_index] * float(scale.per_frame[loop.from_index]))
-            for loop in self.loops.rejected
-        ]
-        return replace(self.loops, accepted=tuple(accepted), rejected=tuple(rejected))
+        return replace(self.loops, accepted=tuple(accepted))
 
 
 def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
@@ -86,7 +79,7 @@ def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Int
     joins = rows.joins(closures.accepted)
     for joined in joins:
         logger.info("%s", joined)
-    return MapClosure(poses, closures, rows.learned_units(), joins)
+    return MapClosure(poses, closures, joins)
 
 
 def views_of(keyframes: Sequence[TrackedKeyframe], points: FloatArray) -> list[View]:
@@ -145,13 +138,6 @@ class _Rows:
         shape = len(tracks), int(first[-1])
         seen = csr_array((np.ones(len(of_row)), (of_row, np.concatenate(tracks))), shape=shape)
         return np.asarray((seen @ seen.T).toarray() < _CONNECTED)
-
-    def learned_units(self) -> dict[int, float]:
-        """The unit of learned depth per unit of each keyframe's map, by its frame."""
-        units: dict[int, float] = {}
-        for segment in self.segments:
-            units |= dict.fromkeys((keyframe.index for keyframe in segment.map.keyframes), learned_unit(segment.map))
-        return units
 
     def joins(self, loops: Sequence[Loop]) -> tuple[TrackingEvent, ...]:
         """Each map after the first that loops join with an earlier one."""

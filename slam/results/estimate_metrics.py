@@ -15,38 +15,19 @@ from erfsfm.evaluation.pose_metrics import (
 )
 from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
-from slam.formats.trajectory import Trajectory, associate
+from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence, runs
 from slam.frontend import gps
 from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import FloatArray, umeyama
+from slam.loops.closure import MOST_REJECTED, LoopClosures
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
-from slam.results.folder import RunFolder
-from slam.results.metrics import (
-    AgreementMetrics,
-    ConfidenceMetrics,
-    CoverageMetrics,
-    Event,
-    GpsErrors,
-    GpsMetrics,
-    GraphMetrics,
-    LearnedDepthError,
-    LoopMetrics,
-    Metrics,
-    Origin,
-    Provenance,
-    ScaleMetrics,
-    SequenceMetrics,
-    Stretch,
-    Timing,
-    TrackingMetrics,
-    Trajectories,
-)
+from slam.results import metrics as records
+from slam.results.metrics import Metrics
 from slam.runtime.attempt import Failed
-from slam.runtime.run_files import TRAJECTORIES
 from slam.runtime.timing import Stopwatch, peak_rss_mb
 
 _NO_TRUTH = Failed("the sequence has no true poses")
@@ -55,7 +36,7 @@ _NO_MAP_YET = Failed("the run ended before its map was whole")
 
 
 def estimate_metrics(
-    result: Estimate, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
+    result: Estimate, sequence: Sequence, provenance: records.Provenance, gps_in_graph: bool = True
 ) -> Metrics:
     """All metrics before the map is fused."""
     return Metrics.of(
@@ -66,10 +47,10 @@ def estimate_metrics(
         sequence=_sequence(result, sequence),
         timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
-        agreement=[AgreementMetrics(**asdict(each)) for each in result.agreements],
-        confidence=ConfidenceMetrics.of(run=result.confidence),
+        agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
+        confidence=records.ConfidenceMetrics.of(run=result.confidence),
         support=_BY_MAPS if result.support is None else result.support.round(2).tolist(),
-        trajectories=Trajectories.of(
+        trajectories=records.Trajectories.of(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),
             optimised=trajectory_metrics(result.optimised, result.reference),
@@ -77,27 +58,12 @@ def estimate_metrics(
         ),
         gps=_gps(result, gps_in_graph),
         graph=_graph(result),
-        loops=LoopMetrics.model_validate(result.loops.summary()),
+        loops=_loops(result.loops),
         tracking=_tracking(result),
         depth_error=_depth_error(result),
         depth=_NO_MAP_YET,
         map=_NO_MAP_YET,
     )
-
-
-def metrics_of_trajectories(folder: RunFolder) -> Trajectories:
-    """Errors of the trajectories in the folder of a killed run; a reason for each missing one."""
-    reference = folder.trajectory("reference")
-    found: dict[str, TrajectoryMetrics | Failed] = {}
-    for name in TRAJECTORIES:
-        estimate = folder.trajectory(name)
-        if estimate is None:
-            found[name] = Failed("the run did not write this trajectory")
-        elif reference is None:
-            found[name] = trajectory_metrics(estimate, None)
-        else:
-            found[name] = trajectory_metrics(*associate(estimate, reference))
-    return Trajectories.of(**found)
 
 
 def lidar_trajectory(result: Estimate) -> Trajectory | None:
@@ -107,10 +73,10 @@ def lidar_trajectory(result: Estimate) -> Trajectory | None:
     return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
 
 
-def timing_of(watch: Stopwatch, frames: int) -> Timing:
+def timing_of(watch: Stopwatch, frames: int) -> records.Timing:
     """The time of a run until now."""
     seconds, peak = watch.seconds, peak_rss_mb()
-    return Timing.of(
+    return records.Timing.of(
         seconds_total=seconds,
         frames_per_second=frames / seconds,
         cpu_seconds=watch.cpu_seconds,
@@ -119,12 +85,12 @@ def timing_of(watch: Stopwatch, frames: int) -> Timing:
     )
 
 
-def _sequence(result: Estimate, sequence: Sequence) -> SequenceMetrics:
+def _sequence(result: Estimate, sequence: Sequence) -> records.SequenceMetrics:
     frames = len(sequence)
     span = float(sequence.stamps[-1] - sequence.stamps[0]) if frames > 1 else 0.0
     drive, reference = result.drive, result.reference
     scans = result.lidar.unreadable if isinstance(result.lidar, LidarPath) else {}
-    return SequenceMetrics.of(
+    return records.SequenceMetrics.of(
         name=sequence.name,
         frames=frames,
         length_m=_NO_TRUTH if reference is None else reference.length_m,
@@ -133,13 +99,13 @@ def _sequence(result: Estimate, sequence: Sequence) -> SequenceMetrics:
         bridged=_stretches(drive.interpolated),
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
-        segments=[Stretch(**asdict(segment)) for segment in drive.segments],
+        segments=[records.Stretch(**asdict(segment)) for segment in drive.segments],
     )
 
 
-def _stretches(reasons: Mapping[int, str]) -> list[Stretch]:
+def _stretches(reasons: Mapping[int, str]) -> list[records.Stretch]:
     """Consecutive frames with the reason of the first."""
-    return [Stretch(first=first, last=last, reason=reasons[first]) for first, last in runs(reasons)]
+    return [records.Stretch(first=first, last=last, reason=reasons[first]) for first, last in runs(reasons)]
 
 
 def _lidar_metrics(result: Estimate, sequence: Sequence) -> TrajectoryMetrics | Failed:
@@ -162,51 +128,63 @@ def _network_snippets(result: Estimate) -> SnippetErrors | None:
     return snippet_errors(predicted, snippets_from_trajectory(result.reference.T_world_camera))
 
 
-def _scale(result: Estimate) -> ScaleMetrics:
+def _scale(result: Estimate) -> records.ScaleMetrics:
     scale, estimate = result.scale, result.scale.estimate
     found = {"value": estimate} if isinstance(estimate, MeasurementFailure) else asdict(estimate)
-    return ScaleMetrics.of(mode=scale.mode, unit=scale.unit, contradicted_steps=len(scale.contradicted), **found)
+    return records.ScaleMetrics.of(
+        mode=scale.mode, unit=scale.unit, contradicted_steps=len(scale.contradicted), **found
+    )
 
 
-def _graph(result: Estimate) -> GraphMetrics:
+def _graph(result: Estimate) -> records.GraphMetrics:
     """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
     if isinstance(result.graph, Failed):
-        return GraphMetrics.unknown(result.graph.reason)
+        return records.GraphMetrics.unknown(result.graph.reason)
     nodes, factors = len(result.optimised), result.graph.relative_poses
     if result.reference is None:
-        return GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)
+        return records.GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
         still = Failed("the estimate does not move: the truth cannot be scaled to it")
-        return GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=still)
+        return records.GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=still)
     covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
-    by_source = {source: CoverageMetrics.of(**shares) for source, shares in covered.items()}
+    by_source = {source: records.CoverageMetrics.of(**shares) for source, shares in covered.items()}
     overall = by_source.pop("")
-    return GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
+    return records.GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
 
 
-def _tracking(result: Estimate) -> TrackingMetrics | Failed:
+def _loops(found: LoopClosures) -> records.LoopMetrics:
+    """Loops by how far they came, and the reasons of the rejected ones with most inliers."""
+    counts = {"candidates": found.candidates, "verified": found.verified, "accepted": len(found.accepted)}
+    if found.not_sought is not None:
+        return records.LoopMetrics.of(**dict.fromkeys(counts, Failed(found.not_sought)), rejected=[])
+    rejected = found.rejected[:MOST_REJECTED]
+    ends = [records.LoopEnds.of(from_=each.from_index, to=each.to_index, reason=each.reason) for each in rejected]
+    return records.LoopMetrics.of(**counts, rejected=ends)
+
+
+def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
     """Keyframes, their maps, and what became of them."""
     drive = result.drive
     if not drive.maps:
         return Failed("this drive has no map of keyframes: it is measured from step to step")
-    return TrackingMetrics(
+    return records.TrackingMetrics(
         keyframes=sum(len(segment.map.keyframes) for segment in drive.maps),
         maps=len(set(drive.map_poses.linked.values())),
         located_frames=len(drive.map_poses.segments),
-        events=[Event(**asdict(event)) for event in drive.events],
+        events=[records.Event(**asdict(event)) for event in drive.events],
     )
 
 
-def _depth_error(result: Estimate) -> list[LearnedDepthError] | Failed:
+def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
     curve, unit = result.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
         return Failed("no step triangulated corners with learned depth")
-    return [LearnedDepthError(depth=unit * at, bias=b, sigma=s, corners=count) for at, b, s, count in curve]
+    return [{"depth": unit * at, "bias": b, "sigma": s, "corners": count} for at, b, s, count in curve]
 
 
-def _gps(result: Estimate, in_graph: bool) -> GpsMetrics | Failed:
+def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
     """Distances of odometry and optimised trajectory from the fixes, and the place of the first camera."""
     location = result.location
     if not isinstance(location, Location):
@@ -216,10 +194,10 @@ def _gps(result: Estimate, in_graph: bool) -> GpsMetrics | Failed:
     ahead = T_enu_first[:3, 2]
     heading = float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0)
     aligned = gps.align(location.fixes, result.odometry.T_world_camera, result.odometry.stamps)
-    return GpsMetrics.of(
+    return records.GpsMetrics.of(
         fixes=len(location.fixes.stamps),
         in_graph=in_graph,
-        origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
+        origin=records.Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
         odometry=aligned
         if isinstance(aligned, MeasurementFailure)
         else _distances(location.fixes, aligned, result.odometry),
@@ -227,10 +205,10 @@ def _gps(result: Estimate, in_graph: bool) -> GpsMetrics | Failed:
     )
 
 
-def _distances(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> GpsErrors:
+def _distances(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> records.GpsErrors:
     apart = gps.offsets(fixes, T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
     level = np.linalg.norm(apart[:, :2], axis=1)
-    return GpsErrors(
+    return records.GpsErrors(
         horizontal_rmse_m=float(np.sqrt((level**2).mean())),
         horizontal_median_m=float(np.median(level)),
         vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean())),

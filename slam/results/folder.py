@@ -11,7 +11,7 @@ from typing import Any
 from erfsfm.common.files import FolderLock
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.metrics import Metrics
-from slam.results.output_folder import claim, stamped
+from slam.results.output import claim, stamped
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, REPORT, trajectory_file

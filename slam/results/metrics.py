@@ -206,15 +206,6 @@ class TrackingMetrics(Record):
     events: list[Event] | None = None
 
 
-class LearnedDepthError(Record):
-    """Bias and relative sigma of learned depth at one depth."""
-
-    depth: float | None = None
-    bias: float | None = None
-    sigma: float | None = None
-    corners: float | None = None
-
-
 class DepthOfKeyframes(Record):
     """Errors of the keyframes' depth, as learned and refined."""
 
@@ -266,7 +257,7 @@ class Metrics(Record):
     graph: GraphMetrics = part(GraphMetrics)
     loops: LoopMetrics = part(LoopMetrics)
     tracking: TrackingMetrics = part(TrackingMetrics)
-    depth_error: list[LearnedDepthError] | None = None
+    depth_error: list[dict[str, float | None]] | None = None  # of learned depth, at some depths
     depth: DepthOfKeyframes = part(DepthOfKeyframes)
     map: MapMetrics = part(MapMetrics)
 
@@ -306,20 +297,18 @@ class Metrics(Record):
         return self.unit == METRES
 
     def unit_notes(self) -> list[str]:
-        """Notes on the unit of length."""
-        if self.scale.mode == "none" and self.unit == CAMERA_HEIGHTS:
-            return [
-                "Scale mode none: lengths of odometry, optimised and the map are in camera heights of the learned road "
-                "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres. "
-                "For metres: camera_height_m in camera.yaml, a GPS track or scale.mode=known."
-            ]
-        if self.scale.mode == "none" and self.unit == NO_UNIT:
-            seen, frames = self.scale.frames_used, self.sequence.frames
-            return [
-                f"No metric unit: {seen} of {frames} frames see a road. Only "
-                "the alignments with scale (scale, 7 dof) compare with metres. For metres, give the distance of two "
-                "frames: --set scale.mode=known --set scale.known_between=[0,50] --set scale.known_m=1.5."
-            ]
+        """What lengths are in where they are not metres, and how they become metres; empty else."""
         if self.is_metric:
             return []
-        return [f"No scale was found ({self.scale.why('value')}): lengths are in {self.unit}, not in metres."]
+        why = f"No scale was found ({self.scale.why('value')}): lengths are in {self.unit}, not in metres."
+        if self.scale.mode != "none":
+            return [why]
+        fitted = "Only the alignments with scale (scale, 7 dof) compare with metres. For metres:"
+        if self.unit == CAMERA_HEIGHTS:
+            why = "Scale mode none: lengths are in camera heights of the learned road plane, not in metres."
+            return [f"{why} {fitted} camera_height_m in camera.yaml, a GPS track or scale.mode=known."]
+        if self.unit == NO_UNIT:
+            why = f"No metric unit: {self.scale.frames_used} of {self.sequence.frames} frames see a road."
+            known = "--set scale.mode=known --set scale.known_between=[0,50] --set scale.known_m=1.5"
+            return [f"{why} {fitted} give the distance of two frames, {known}."]
+        return [why]

@@ -27,17 +27,16 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SystemRun:
-    """One trajectory of a system, its poses that have a true one, their truth, and its errors."""
+    """One trajectory of a system, the number of its poses that have a true one, and its errors."""
 
     system: str
     path: Path
-    estimate: Trajectory
-    reference: Trajectory
+    poses: int
     errors: TrajectoryMetrics
 
     def tree(self) -> dict[str, Any]:
         """For JSON: the system, the file, the number of compared poses, and T of ``metrics.json``."""
-        return {"system": self.system, "path": str(self.path), "poses": len(self.estimate)} | self.errors.tree()
+        return {"system": self.system, "path": str(self.path), "poses": self.poses} | self.errors.tree()
 
 
 def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
@@ -104,7 +103,7 @@ def compare(
             raise TrajectoryError(f"{path}: {error}") from error
         for line in likely_mistakes(estimate, truth, pair):
             logger.warning("%s: %s", path, line)
-        runs.append(SystemRun(name, path, *pair, trajectory_metrics(*pair)))
+        runs.append(SystemRun(name, path, len(pair[0]), trajectory_metrics(*pair)))
     return runs
 
 
@@ -128,7 +127,7 @@ def write_csv(runs: Sequence[SystemRun], output: Path) -> None:
 def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
     for system in dict.fromkeys(run.system for run in runs):
         own = [run for run in runs if run.system == system]
-        poses = "/".join(map(str, sorted({len(run.estimate) for run in own})))
+        poses = "/".join(map(str, sorted({run.poses for run in own})))
         name = f"{system} ({len(own)} runs)" if len(own) > 1 else system
         yield [name, poses, *(_spread(column, own) for column in COLUMNS)]
 

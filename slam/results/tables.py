@@ -6,23 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from erfsfm.common.table import DASH, Table
-from slam.evaluation.trajectory import ALIGNMENTS, TrajectoryMetrics
-from slam.results.metrics import Metrics
-from slam.runtime.errors import RunError
+from slam.evaluation.trajectory import ALIGNMENTS, AlignedMetrics, TrajectoryMetrics
 
 if TYPE_CHECKING:
     from slam.results.folder import RunFolder
 
 UNITS = "ATE: RMSE, m; of snippets of five frames, each with its own scale, norm / 5. RE: rad. t_rel, r_rel: 7 dof."
 _LEAK = "LEAK: the weights were trained on the sequence; the numbers are no test."
-_OF_ALIGNMENT = {
-    "ATE\nm": ("ate_rmse_m", 3),
-    "t_rel\n%": ("t_rel_percent", 2),
-    "r_rel\ndeg/100m": ("r_rel_deg_per_100m", 3),
-    "RPE\nm": ("rpe_trans_m", 4),
-    "RPE\ndeg": ("rpe_rot_deg", 4),
-    "scale": ("scale", 4),
-}
 
 
 class ErrorColumn(NamedTuple):
@@ -64,9 +54,12 @@ def errors_table(trajectories: Mapping[str, TrajectoryMetrics], title: str = "")
 
 def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
     """Every statistic of one trajectory under every alignment, and its snippets below."""
-    values = {how: [errors.at(f"align.{how}.{key}") for key, _ in _OF_ALIGNMENT.values()] for how in ALIGNMENTS}
-    decimals = [decimals for _, decimals in _OF_ALIGNMENT.values()]
-    rows = [[how, *(written(value, k) for (value, _), k in zip(row, decimals))] for how, row in values.items()]
+    statistics = AlignedMetrics.statistics()
+    values = {how: [errors.at(f"align.{how}.{key}") for key in statistics] for how in ALIGNMENTS}
+    rows = [
+        [how, *(written(value, each.decimals) for (value, _), each in zip(row, statistics.values()))]
+        for how, row in values.items()
+    ]
     missing = {reason: None for row in values.values() for value, reason in row if value is None}
     snippets, evo = errors.snippet5, errors.evo
     notes = [
@@ -76,18 +69,18 @@ def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
         f"{written(evo.rpe_rot_deg, 4)} deg; largest difference to ours {written(evo.difference, 1)}.",
         *(f"{DASH} {reason}." for reason in missing),
     ]
-    return Table(["alignment", *_OF_ALIGNMENT], rows, title, notes)
+    return Table(["alignment", *(each.header for each in statistics.values())], rows, title, notes)
 
 
 def runs_table(runs: Sequence[RunFolder]) -> Table:
     """One row for each run and trajectory; runs that failed or were killed with the reason.
 
     Raises:
-        RunError: no run was given, or its ``metrics.json`` is damaged.
+        RunError: a ``metrics.json`` is damaged.
     """
     rows: list[list[str]] = []
     notes: dict[str, None] = {UNITS: None}
-    for name, metrics in zip(_names(runs), _contents(runs)):
+    for name, metrics in zip(_names(runs), (run.metrics() for run in runs)):
         errors, title = metrics.evaluated_errors(), name
         if metrics.failure:
             ended = "failed" if metrics.status == "failed" else "did not end"
@@ -110,10 +103,11 @@ def runs_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
     """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory.
 
     Raises:
-        RunError: no run was given, or its ``metrics.json`` is damaged.
+        RunError: a ``metrics.json`` is damaged.
     """
     objects = []
-    for run, metrics in zip(runs, _contents(runs)):
+    for run in runs:
+        metrics = run.metrics()
         tree = metrics.tree()
         entry: dict[str, Any] = {"run": str(run.path), "status": metrics.status}
         if metrics.failure:
@@ -148,19 +142,3 @@ def _names(runs: Sequence[RunFolder]) -> list[str]:
     """Short names of runs: the folder's own, or the whole path where it is not unique."""
     names = [run.path.resolve().name for run in runs]
     return [str(run.path) if names.count(name) > 1 else name for run, name in zip(runs, names)]
-
-
-def _contents(runs: Sequence[RunFolder]) -> list[Metrics]:
-    if not runs:
-        raise RunError("no run was given: name one or more run folders")
-    return [_metrics(run) for run in runs]
-
-
-def _metrics(run: RunFolder) -> Metrics:
-    """The metrics of a run; where it was killed before it wrote them, those of its trajectories."""
-    metrics = run.metrics()
-    if metrics.trajectories.absent and run.trajectory("optimised") is not None:
-        from slam.results.estimate_metrics import metrics_of_trajectories
-
-        return metrics.changed(trajectories=metrics_of_trajectories(run))
-    return metrics

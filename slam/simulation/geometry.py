@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -28,30 +29,21 @@ class Mesh:
     """A finished mesh in the street frame (x east, y north, z up, metres).
 
     Triangles and instances are the last axis of the lookup tables, for which gathering is several times faster.
-
-    Attributes:
-        vertices: ``(V, 3)``.
-        triangles: vertex indices, ``(T, 3)``.
-        uv: texture coordinates of the three corners, metres, ``(3, 2, T)``.
-        normals: unit normals, ``(3, T)``.
-        tangents: unit direction in which u grows, ``(3, T)``.
-        instance: index into the tables below, ``(T,)``.
-        material: of each triangle, ``(T,)``.
-        colours: two base colours per instance, RGB in [0, 1], ``(2, 3, I)``.
-        parameters: of the material's texture, ``(PARAMETERS, I)``.
-        offsets: of an instance in the noise texture, ``(2, I)``.
     """
 
-    vertices: Float32Array
-    triangles: NDArray[np.uint32]
-    uv: Float32Array
-    normals: Float32Array
-    tangents: Float32Array
-    instance: NDArray[np.int32]
-    material: NDArray[np.int8]
-    colours: Float32Array
-    parameters: Float32Array
-    offsets: Float32Array
+    vertices: Float32Array  # (V, 3)
+    triangles: NDArray[np.uint32]  # vertex indices, (T, 3)
+    uv: Float32Array  # texture coordinates of the three corners, metres, (3, 2, T)
+    normals: Float32Array  # unit normals, (3, T)
+    tangents: Float32Array  # unit direction in which u grows, (3, T)
+    instance: NDArray[np.int32]  # index into the tables below, (T,)
+    material: NDArray[np.int8]  # of each triangle, (T,)
+    colours: Float32Array  # two base colours per instance, RGB in [0, 1], (2, 3, I)
+    parameters: Float32Array  # of the material's texture, (PARAMETERS, I)
+    offsets: Float32Array  # of an instance in the noise texture, (2, I)
+
+
+_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
 
 @functools.lru_cache(maxsize=256)
@@ -97,13 +89,7 @@ class Soup:
         return len(self._materials) - 1
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
-        """Add a grid of quads.
-
-        Args:
-            points: plan coordinates of the grid's vertices, ``(R, C, 3)``.
-            uv: texture coordinates in metres, ``(R, C, 2)``.
-            instance: from :meth:`instance`.
-        """
+        """Add a grid of quads: vertices in the plan ``(R, C, 3)`` and texture coordinates in metres ``(R, C, 2)``."""
         triangles = _patch_triangles(points.shape[0], points.shape[1])
         self._vertices.append(points.reshape(-1, 3))
         self._uv.append(uv.reshape(-1, 2)[triangles])
@@ -157,20 +143,13 @@ class Bend:
     """A smooth map from the plan (straight streets, flat ground) to the street frame.
 
     Streets of a town are swayed by two slow sine waves; a lone road follows a heading that wanders.
-
-    Attributes:
-        amplitudes: of the sway in x and in y and of the hills, metres, ``(3,)``.
-        wavelengths: of the same, metres, ``(3,)``.
-        phases: of the same, radians, ``(3, 2)``.
-        road: x, y and heading of a lone road every metre from plan x = ``road_start``, ``(M, 3)``; or None.
-        road_start: plan x of its first row.
     """
 
-    amplitudes: FloatArray
-    wavelengths: FloatArray
-    phases: FloatArray
-    road: FloatArray | None = None
-    road_start: float = 0.0
+    amplitudes: FloatArray  # of the sway in x and in y and of the hills, metres, (3,)
+    wavelengths: FloatArray  # of the same, metres, (3,)
+    phases: FloatArray  # of the same, radians, (3, 2)
+    road: FloatArray | None = None  # x, y and heading of a lone road every metre from road_start on, (M, 3)
+    road_start: float = 0.0  # plan x of its first row
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Map plan points ``(..., 3)`` to the street frame."""
@@ -215,8 +194,12 @@ def road_bend(rng: np.random.Generator, start: float, end: float, hills: tuple[f
 class Moving:
     """Meshes around their own origins, to be placed anew at every frame."""
 
-    def __init__(self, soup: Soup, first_instances: list[int]) -> None:
-        """Things in a soup, each of which begins with one of these instances."""
+    def __init__(self, rng: np.random.Generator, makers: Sequence[Callable[[Soup], None]]) -> None:
+        """Things that are made one after another in one soup."""
+        soup, first_instances = Soup(rng), []
+        for make in makers:
+            first_instances.append(soup.instances)
+            make(soup)
         self._mesh = soup.finish(FLAT)
         self._thing_of_triangle = np.searchsorted(first_instances, self._mesh.instance, side="right") - 1
 
@@ -226,28 +209,15 @@ class Moving:
             return []
         parts = [self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()]
         corners = np.concatenate([part.vertices for part in parts])
-        placed = dataclasses.replace(
-            self._mesh,
-            vertices=corners,
-            triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
-            uv=np.concatenate([part.uv for part in parts], axis=-1),
-            normals=np.concatenate([part.normals for part in parts], axis=-1),
-            tangents=np.concatenate([part.tangents for part in parts], axis=-1),
-            instance=np.concatenate([part.instance for part in parts]),
-            material=np.concatenate([part.material for part in parts]),
-        )
-        return [placed]
+        corners_of = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+        tables = {name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in _OF_TRIANGLES}
+        return [dataclasses.replace(self._mesh, vertices=corners, triangles=corners_of, **tables)]
 
     def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:
         """The triangles of one thing, three vertices each, moved into the scene."""
         mine = self._thing_of_triangle == number
         R, t = T_scene_thing[:3, :3].astype(np.float32), T_scene_thing[:3, 3].astype(np.float32)
-        return dataclasses.replace(
-            self._mesh,
-            vertices=self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t,
-            uv=self._mesh.uv[..., mine],
-            normals=R @ self._mesh.normals[:, mine],
-            tangents=R @ self._mesh.tangents[:, mine],
-            instance=self._mesh.instance[mine],
-            material=self._mesh.material[mine],
-        )
+        tables = {name: getattr(self._mesh, name)[..., mine] for name in _OF_TRIANGLES}
+        tables |= {name: R @ tables[name] for name in ("normals", "tangents")}
+        vertices = self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t
+        return dataclasses.replace(self._mesh, vertices=vertices, **tables)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving, Soup
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
 from slam.simulation.objects import car, frame_at
 from slam.simulation.route import STEP, Route
 
@@ -89,12 +89,8 @@ class Traffic:
         self._passing = self._plan_passing(np.random.default_rng([seed, 34])) if overtaking else []
         self._gap = float(rng.uniform(9.0, 14.0)) / STEP
         self._leader_leaves = float(rng.uniform(0.4, 0.8)) * len(drive.sample)
-        soup = Soup(rng)
-        firsts = []
-        for _ in range(1 + len(self._starts) + len(self._passing)):
-            firsts.append(soup.instances)
-            car(soup, rng, frame_at(0.0, 0.0, 0.0))
-        self._cars = Moving(soup, firsts)
+        count = 1 + len(self._starts) + len(self._passing)
+        self._cars = Moving(rng, [lambda soup: car(soup, rng, frame_at(0.0, 0.0, 0.0))] * count)
 
     def _plan_passing(self, rng: np.random.Generator) -> list[tuple[float, float, float]]:
         """Cars on the camera's left, and slower ones on its right, in the form of ``_starts``."""

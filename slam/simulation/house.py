@@ -21,19 +21,12 @@ KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
 
 @dataclass(frozen=True)
 class Room:
-    """A room between its walls; x east, y north, metres.
+    """A room between its walls; x east, y north, metres."""
 
-    Attributes:
-        kind: one of ``KINDS``, ``corridor`` or ``hall``.
-        area: of its floor.
-        height: of its ceiling.
-        outside: sides with daylight: 0 south, 1 east, 2 north, 3 west.
-    """
-
-    kind: str
-    area: Rectangle
-    height: float
-    outside: tuple[int, ...]
+    kind: str  # one of KINDS, corridor or hall
+    area: Rectangle  # of its floor
+    height: float  # of its ceiling
+    outside: tuple[int, ...]  # sides with daylight: 0 south, 1 east, 2 north, 3 west
 
     def contains(self, points: FloatArray) -> NDArray[np.bool_]:
         """Which points of the plan ``(N, 2)`` are inside, ``(N,)``."""

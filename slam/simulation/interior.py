@@ -18,17 +18,11 @@ _STEP = 0.5  # between the vertices of walls, which carry the light, metres
 
 @dataclass(frozen=True)
 class Interior:
-    """A furnished house.
+    """A furnished house."""
 
-    Attributes:
-        mesh: all surfaces.
-        obstacles: what stands on the floors, in plan.
-        lights: position and strength of lamps and windows, ``(L, 4)``.
-    """
-
-    mesh: Mesh
-    obstacles: list[Rectangle]
-    lights: FloatArray
+    mesh: Mesh  # all surfaces
+    obstacles: list[Rectangle]  # what stands on the floors, in plan
+    lights: FloatArray  # position and strength of lamps and windows, (L, 4)
 
 
 def furnish(house: House, seed: int) -> Interior:

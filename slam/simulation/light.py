@@ -11,31 +11,18 @@ from slam.simulation.texture import Texels, fractal
 
 @dataclass(frozen=True)
 class Weather:
-    """How a world is lit.
+    """How a world is lit."""
 
-    Attributes:
-        sun: unit direction towards the sun, street frame, ``(3,)``.
-        sunshine: strength of the direct light, 0 overcast.
-        ambient: strength of the light from everywhere.
-        zenith: colour of the sky overhead, ``(3,)``.
-        horizon: colour of the sky low down, and of the haze, ``(3,)``.
-        clouds: cover, 0 to 1.
-        visibility_m: distance at which the haze has taken 63 %.
-        exposure: gain of the camera; None sets it so that a share of the pixels saturates.
-        saturated: that share.
-        contrast: of textures, an exponent; 1 as they are painted.
-    """
-
-    sun: Float32Array
-    sunshine: float
-    ambient: float
-    zenith: Float32Array
-    horizon: Float32Array
-    clouds: float
-    visibility_m: float
-    exposure: float | None
-    saturated: float = 0.0
-    contrast: float = 1.0
+    sun: Float32Array  # unit direction towards the sun, street frame, (3,)
+    sunshine: float  # strength of the direct light, 0 overcast
+    ambient: float  # strength of the light from everywhere
+    zenith: Float32Array  # colour of the sky overhead, (3,)
+    horizon: Float32Array  # colour of the sky low down, and of the haze, (3,)
+    clouds: float  # cover, 0 to 1
+    visibility_m: float  # distance at which the haze has taken 63 %
+    exposure: float | None  # gain of the camera; None sets it so that a share of the pixels saturates
+    saturated: float = 0.0  # that share
+    contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
 
 
 def draw_weather(seed: int) -> Weather:
@@ -94,13 +81,7 @@ def sky(weather: Weather, directions: Float32Array) -> Float32Array:
 
 
 def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32Array:
-    """Irradiance on surfaces that face the viewer, ``(3, N)``.
-
-    Args:
-        weather: of the world.
-        normals: unit, towards the viewer, ``(3, N)``.
-        lit: 1 where the sun is seen, ``(N,)``.
-    """
+    """Irradiance ``(3, N)`` on surfaces of unit normals ``(3, N)`` towards the viewer; ``lit`` is 1 in the sun."""
     direct = weather.sunshine * np.clip(weather.sun @ normals, 0.0, 1.0) * lit
     around = weather.ambient * (0.78 + 0.22 * normals[2])
     warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
@@ -109,15 +90,7 @@ def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32
 
 
 def paint(mesh: Mesh, hits: Hits, lit: Float32Array, weather: Weather, focal_px: float) -> Float32Array:
-    """Colour of each hit in the open, ``(3, N)``.
-
-    Args:
-        mesh: what was hit.
-        hits: where, sorted by material.
-        lit: 1 where the sun is seen, ``(N,)``.
-        weather: of the world.
-        focal_px: focal length in pixels.
-    """
+    """Colour ``(3, N)`` of each hit on a mesh in the open; ``lit`` ``(N,)`` is 1 where the sun is seen."""
     rgb = unlit(mesh, hits, focal_px)
     if weather.contrast != 1.0:
         base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)

@@ -21,34 +21,21 @@ _CLEAR_M = 0.4  # of the carrier in the plan, where nothing is swayed any furthe
 
 @dataclass(frozen=True)
 class Gait:
-    """How one kind of carrier moves.
+    """How one kind of carrier moves."""
 
-    Attributes:
-        height_m: of the camera, lowest and highest.
-        climb_m: by how much the height wanders on the way.
-        speed: metres a second.
-        turn_deg: a second, at most, on the spot.
-        rests: what it does at a place: shares of turning, sweeping and standing still; their sum is how many.
-        bob_m: up and down with every step.
-        sway_m: to the sides with every second step, and by unrest.
-        wander_deg: how far it looks to the sides, and by a third of it up and down, on its way.
-        tremor_deg: of the hand or the motors.
-        pitch_deg: of the camera, upwards.
-    """
-
-    height_m: tuple[float, float]
-    climb_m: float
-    speed: float
-    turn_deg: float
-    rests: tuple[float, float, float]
-    bob_m: float
-    sway_m: float
-    wander_deg: float
-    tremor_deg: float
-    pitch_deg: float
+    height_m: tuple[float, float]  # of the camera, lowest and highest
+    climb_m: float  # by how much the height wanders on the way
+    speed: float  # metres a second
+    turn_deg: float  # a second, at most, on the spot
+    rests: tuple[float, float, float]  # how often it turns, sweeps and stands still at a place
+    bob_m: float  # up and down with every step
+    sway_m: float  # to the sides with every second step, and by unrest
+    wander_deg: float  # how far it looks to the sides, and by a third of it up and down, on its way
+    tremor_deg: float  # of the hand or the motors
+    pitch_deg: float  # of the camera, upwards
 
 
-GAITS: dict[Motion, Gait] = {
+GAITS: dict[str, Gait] = {
     "walk": Gait((1.45, 1.7), 0.02, 1.1, 80.0, (0.5, 0.2, 0.3), 0.025, 0.03, 10.0, 0.25, -3.0),
     "look": Gait((1.45, 1.7), 0.05, 0.8, 70.0, (1.6, 1.0, 0.4), 0.02, 0.03, 14.0, 0.3, -2.0),
     "phone": Gait((1.2, 1.5), 0.08, 0.8, 110.0, (0.8, 0.8, 0.4), 0.015, 0.04, 22.0, 0.5, -10.0),
@@ -60,13 +47,9 @@ assert tuple(GAITS) == get_args(Motion)
 
 @dataclass(frozen=True)
 class Carried:
-    """A motion, ``CLOCK`` samples a second.
+    """A motion, ``CLOCK`` samples a second."""
 
-    Attributes:
-        channels: x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians, ``(M, 6)``.
-    """
-
-    channels: FloatArray
+    channels: FloatArray  # x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians, (M, 6)
 
     def at(self, seconds: FloatArray) -> FloatArray:
         """The channels at times ``(N,)``, ``(6, N)``."""
@@ -83,7 +66,7 @@ class Carried:
         return upright @ se3.from_rotation_vector(np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3)))
 
 
-def carry(floor: Floor, motion: Motion, seconds: float, rate: float, seed: int) -> Carried:
+def carry(floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> Carried:
     """A motion of so many seconds for a camera of ``rate`` frames a second."""
     rng, gait = np.random.default_rng([seed, 53, *motion.encode()]), GAITS[motion]
     turn = np.deg2rad(min(gait.turn_deg, 0.9 * FASTEST_TURN_DEG * rate))

@@ -1,7 +1,7 @@
 """What is simulated: the options of all worlds, and which of them a world has."""
 
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 from slam.runtime.errors import SequenceError
 from slam.simulation.hazards import Hazard
@@ -16,7 +16,6 @@ _READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
 _RATES = (5.0, 60.0)
 
 RoomHazard = Literal["people", "exposure", "blur", "rolling-shutter", "stop"]
-WorldKind = RouteKind | Literal["rooms"]
 WORLD_KINDS: tuple[str, ...] = (*get_args(RouteKind), "rooms")
 
 
@@ -30,14 +29,14 @@ class SimulationOptions:
     ``fov_deg`` is the horizontal field of view of square pixels; None is that of the world's own camera.
     """
 
-    route: WorldKind = "loop"
+    route: str = "loop"
     frames: int = 300
     seed: int = 0
     width: int = 416
     height: int = 128
-    hazards: tuple[Hazard | RoomHazard, ...] = ()
+    hazards: tuple[str, ...] = ()
     varied: bool = False
-    motion: Motion | None = None
+    motion: str | None = None
     rate: float = STREET_RATE
     fov_deg: float | None = None
 
@@ -72,25 +71,3 @@ class SimulationOptions:
     def readout_s(self) -> float:
         """The time from the first row of an image to the last: zero unless the shutter rolls."""
         return min(_READOUT_S, 0.9 / self.rate) if "rolling-shutter" in self.hazards else 0.0
-
-
-def parse_options(
-    route: str,
-    frames: int,
-    seed: int,
-    width: int,
-    height: int,
-    hazards: str,
-    varied: bool = False,
-    motion: str | None = None,
-    rate: float = STREET_RATE,
-) -> SimulationOptions:
-    """Options from a command line; ``hazards`` is a comma list.
-
-    Raises:
-        SequenceError: if one of them is invalid.
-    """
-    names = tuple(name.strip() for name in hazards.split(",") if name.strip())
-    kinds = cast(tuple[Hazard | RoomHazard, ...], names)
-    kind, moved = cast(WorldKind, route), cast(Motion | None, motion)
-    return SimulationOptions(kind, frames, seed, width, height, kinds, varied, moved, rate)

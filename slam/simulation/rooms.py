@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, IntArray, Material, Mesh, Moving, Soup
+from slam.simulation.geometry import Float32Array, FloatArray, IntArray, Material, Mesh, Moving
 from slam.simulation.hazards import SHUTTER
 from slam.simulation.house import Floor, House, draw_house
 from slam.simulation.interior import Interior, furnish
@@ -53,7 +53,9 @@ class SimulatedRooms(SimulatedWorld):
         motions = _PEOPLE if "people" in options.hazards else 1
         self._carried = carry(floor, options.motion or "walk", seconds, options.rate, options.seed)
         self._walks = [carry(floor, "walk", seconds, options.rate, options.seed + 1000 * k) for k in range(1, motions)]
-        self._people = _people(options.seed) if "people" in options.hazards else None
+        rng = np.random.default_rng([options.seed, 57])
+        crowd = [lambda soup: person(soup, rng, 0.0, 0.0)] * _PEOPLE  # around their own origins, looking along x
+        self._people = Moving(rng, crowd) if "people" in options.hazards else None
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
             fov = float(np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG))))
@@ -169,16 +171,6 @@ def _furnished_house(seed: int) -> tuple[House, Interior]:
     return house, furnish(house, seed)
 
 
-def _people(seed: int) -> Moving:
-    """People around their own origins, who look along x."""
-    rng = np.random.default_rng([seed, 57])
-    soup, firsts = Soup(rng), []
-    for _ in range(_PEOPLE):
-        firsts.append(soup.instances)
-        person(soup, rng, 0.0, 0.0)
-    return Moving(soup, firsts)
-
-
 def _standing(walk: Carried, seconds: float) -> FloatArray:
     """``T_scene_person`` of whoever walks so, upright on the floor."""
     x, y, _, yaw, _, _ = walk.at(np.array([seconds]))[:, 0]
@@ -189,9 +181,7 @@ def _standing(walk: Carried, seconds: float) -> FloatArray:
 def illuminate(surface: Surface, lights: FloatArray) -> Float32Array:
     """Irradiance at the corners of triangles, about 1 below a lamp, ``(3, T)``.
 
-    Args:
-        surface: triangles that face the side that is seen.
-        lights: position and strength of each, ``(L, 4)``.
+    ``lights`` ``(L, 4)`` are positions and strengths; triangles face the side that is seen.
     """
     mesh = surface.mesh
     triangles = mesh.triangles.astype(np.int64)

@@ -33,39 +33,22 @@ FEWEST_LOOP_FRAMES = 250
 
 @dataclass(frozen=True)
 class Route:
-    """The camera's trajectory through a street plan.
+    """The camera's trajectory through a street plan."""
 
-    Attributes:
-        plan: the streets.
-        bend: from plan to street coordinates.
-        T_street_camera: ``(N, 4, 4)``; street: x east, y north, z up, metres.
-        camera_height_m: of the camera at rest above the road.
-        lane_street: the driven path on the road, at least ``STEP`` metres of plan each, ``(M, 3)``.
-        lane_offset_m: from the middle of the street to the right.
-        sample: where in ``lane_street`` each frame is, ``(N,)``.
-    """
-
-    plan: StreetPlan
-    bend: Bend
-    T_street_camera: FloatArray
-    camera_height_m: float
-    lane_street: FloatArray
-    lane_offset_m: float
-    sample: FloatArray
+    plan: StreetPlan  # the streets
+    bend: Bend  # from plan to street coordinates
+    T_street_camera: FloatArray  # (N, 4, 4); street: x east, y north, z up, metres
+    camera_height_m: float  # of the camera at rest above the road
+    lane_street: FloatArray  # the driven path on the road, at least STEP metres of plan each, (M, 3)
+    lane_offset_m: float  # from the middle of the street to the right
+    sample: FloatArray  # where in lane_street each frame is, (N,)
 
 
-def plan_route(
-    route: RouteKind, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None
-) -> Route:
-    """Lay out streets and a drive of ``frames`` frames over them.
+def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None) -> Route:
+    """Lay out streets and a drive of so many frames over them; ``still_frames`` stand in the middle.
 
-    Args:
-        route: ``loop`` drives its start again, ``grid`` repeats streets in both directions (with about
-            250 frames), ``straight`` never comes back.
-        frames: how many poses.
-        seed: decides everything.
-        still_frames: how long to stand still in the middle.
-        variety: of street and camera; None for a town and a camera like KITTI's.
+    A ``loop`` drives its start again, a ``grid`` repeats streets in both directions (with about 250 frames), and
+    ``straight`` never comes back. Without a ``variety`` it is a town, and a camera like KITTI's.
 
     Raises:
         SequenceError: if there are too few frames for the route.
@@ -93,7 +76,7 @@ def plan_route(
 
 
 def _layout(
-    route: RouteKind, moving: int, seed: int, stops: bool, variety: Variety | None
+    route: str, moving: int, seed: int, stops: bool, variety: Variety | None
 ) -> tuple[StreetPlan, Bend, FloatArray]:
     """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
     rng = np.random.default_rng([seed, 0])

@@ -35,14 +35,9 @@ def footprint(
 ) -> tuple[Float32Array, Float32Array]:
     """Extent of a pixel on a surface along its u and v axes, grazing angle included.
 
-    A round pixel of size f seen at angle a to the normal is an ellipse of axes f and f / cos a; along a
-    tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a).
-
-    Args:
-        pixel: size of the pixel at the surface's distance, metres, ``(N,)``.
-        rays: unit, ``(3, N)``.
-        normals: unit, ``(3, N)``.
-        tangents: unit direction of u, ``(3, N)``.
+    A round pixel of size f ``(N,)``, metres at the surface's distance, seen by rays at angle a to the normals is an
+    ellipse of axes f and f / cos a; along a tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a). All directions are
+    unit, ``(3, N)``.
     """
     cosine = np.abs((rays * normals).sum(axis=0))
     along_u = (rays * tangents).sum(axis=0)
@@ -83,11 +78,7 @@ def measured(
 ) -> Float32Array:
     """Points x, y, z (LiDAR frame, metres) and reflectance in [0, 1] of the rays that came back, ``(M, 4)``.
 
-    Args:
-        directions: unit, LiDAR frame, ``(N, 3)``.
-        ranges_m: exact, infinite where nothing was hit, ``(N,)``.
-        reflectance: of what was hit, ``(N,)``.
-        rng: of the range noise.
+    Of rays in unit directions ``(N, 3)``, with exact ranges ``(N,)``, infinite where nothing was hit.
     """
     kept = (ranges_m > NEAREST_M) & (ranges_m < FARTHEST_M)
     noisy = ranges_m[kept] + rng.normal(0.0, RANGE_NOISE_M, int(kept.sum()))

@@ -4,7 +4,6 @@ Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/simulation``
 """
 
 import functools
-from typing import cast
 
 import cv2
 import numpy as np
@@ -12,12 +11,12 @@ from numpy.typing import NDArray
 
 from slam.runtime.imports import import_open3d
 from slam.simulation import hazards as effects
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving, Soup
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
 from slam.simulation.hazards import Traffic
 from slam.simulation.light import draw_varied_weather, draw_weather, paint, sky
 from slam.simulation.objects import bonnet
 from slam.simulation.options import SimulationOptions
-from slam.simulation.route import RouteKind, plan_route
+from slam.simulation.route import plan_route
 from slam.simulation.sensors import T_CAMERA_LIDAR, beam_directions, kitti_intrinsics, measured, square_intrinsics
 from slam.simulation.surface import Hits, Surface, place_rays
 from slam.simulation.town import build_town
@@ -46,7 +45,7 @@ class SimulatedStreet(SimulatedWorld):
             K = variety.intrinsics(options.width, options.height)
         if options.fov_deg is not None:
             K = square_intrinsics(options.width, options.height, options.fov_deg)
-        self._route = plan_route(cast(RouteKind, options.route), options.frames, options.seed, still, variety)
+        self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, K, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
         self.T_camera_lidar = T_CAMERA_LIDAR.copy()
@@ -85,10 +84,8 @@ class SimulatedStreet(SimulatedWorld):
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
         rng = np.random.default_rng([self.options.seed, 12])
-        soup = Soup(rng)
         below = (self.options.height * (1.0 - self._variety.bonnet) - self.K[1, 2]) / self.K[1, 1]
-        bonnet(soup, rng, float(below), self.camera_height_m)
-        return Moving(soup, [0])
+        return Moving(rng, [lambda soup: bonnet(soup, rng, float(below), self.camera_height_m)])
 
     @functools.cached_property
     def _gain(self) -> float:

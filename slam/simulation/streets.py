@@ -24,25 +24,15 @@ _ROADS: dict[StreetKind, tuple[float, float, float, tuple[float, float]]] = {  #
 
 @dataclass(frozen=True)
 class StreetPlan:
-    """Streets in plan coordinates (metres, x east, y north, z = 0 the road).
+    """Streets in plan coordinates (metres, x east, y north, z = 0 the road)."""
 
-    Attributes:
-        xs: x of the grid lines, the first and last of which are the edge of town, ``(X,)``.
-        ys: y of the grid lines, likewise, ``(Y,)``.
-        along_x: whether the edge from node (i, j) to (i + 1, j) is a street, ``(X - 1, Y)``.
-        along_y: whether the edge from node (i, j) to (i, j + 1) is a street, ``(X, Y - 1)``.
-        half_width: of every street, metres.
-        drive: nodes in the order in which the camera passes them.
-        kind: of streets and what stands beside them.
-    """
-
-    xs: FloatArray
-    ys: FloatArray
-    along_x: BoolArray
-    along_y: BoolArray
-    half_width: float
-    drive: tuple[Node, ...]
-    kind: StreetKind = "town"
+    xs: FloatArray  # x of the grid lines, the first and last of which are the edge of town, (X,)
+    ys: FloatArray  # y of the grid lines, likewise, (Y,)
+    along_x: BoolArray  # whether the edge from node (i, j) to (i + 1, j) is a street, (X - 1, Y)
+    along_y: BoolArray  # whether the edge from node (i, j) to (i, j + 1) is a street, (X, Y - 1)
+    half_width: float  # of every street, metres
+    drive: tuple[Node, ...]  # nodes in the order in which the camera passes them
+    kind: StreetKind = "town"  # of streets and what stands beside them
 
     def node(self, node: Node) -> FloatArray:
         """Plan position of a node, ``(2,)``."""
@@ -57,14 +47,9 @@ class StreetPlan:
 
 
 def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
-    """Outline of a random simply connected set of cells, with left and right corners.
+    """Outline of a random simply connected set of cells, with left and right corners, of ``edges`` (even, 8 or more).
 
-    Args:
-        rng: decides the shape.
-        edges: length of the outline, even and at least 8.
-
-    Returns:
-        The nodes of the outline in order, clockwise or counter-clockwise; the smallest coordinates are zero.
+    Its nodes in order, clockwise or counter-clockwise; the smallest coordinates are zero.
     """
     while True:
         cells = {(0, 0)}
@@ -83,11 +68,7 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
 def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> list[Node]:
     """A walk on ``side`` x ``side`` nodes without U-turns that repeats streets, also in the opposite direction.
 
-    Args:
-        rng: decides the route.
-        side: nodes along each side.
-        edges: within which the streets are driven again.
-        spare: further edges, in case the drive comes so far.
+    It does so within ``edges``, and has some ``spare`` ones, in case the drive comes so far.
     """
     best: tuple[float, list[Node]] = (-1.0, [])
     for _ in range(300):
@@ -111,14 +92,10 @@ def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> li
 def town_plan(
     rng: np.random.Generator, drive: list[Node], spacing: float, side_streets: float, kind: StreetKind = "town"
 ) -> StreetPlan:
-    """Lay streets under a drive, and some more beside it.
+    """Lay streets under a drive over nodes, smallest coordinates zero, and some more beside it.
 
-    Args:
-        rng: decides spacings, width and side streets.
-        drive: nodes to pass, smallest coordinates zero.
-        spacing: mean distance between parallel streets, metres.
-        side_streets: probability that an edge which is not driven is a street.
-        kind: of streets.
+    ``spacing`` is the mean distance of parallel streets in metres, ``side_streets`` the probability that an edge which
+    is not driven is a street.
     """
     span = np.max(drive, axis=0)
     lines = [_lines(rng, int(count), spacing) for count in span]

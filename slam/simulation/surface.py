@@ -62,23 +62,14 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
 
 @dataclass(frozen=True)
 class Hits:
-    """Rays that met a mesh, sorted by material.
+    """Rays that met a mesh, sorted by material."""
 
-    Attributes:
-        triangle: which, ``(N,)``.
-        barycentric: weights of its second and third corner, ``(2, N)``.
-        rays: unit directions in the mesh's frame, ``(3, N)``.
-        normals: unit, turned towards the viewer, ``(3, N)``.
-        depth: z-depth, metres, ``(N,)``.
-        distance: along the ray, metres, ``(N,)``.
-    """
-
-    triangle: NDArray[np.int64]
-    barycentric: Float32Array
-    rays: Float32Array
-    normals: Float32Array
-    depth: Float32Array
-    distance: Float32Array
+    triangle: NDArray[np.int64]  # which, (N,)
+    barycentric: Float32Array  # weights of its second and third corner, (2, N)
+    rays: Float32Array  # unit directions in the mesh's frame, (3, N)
+    normals: Float32Array  # unit, turned towards the viewer, (3, N)
+    depth: Float32Array  # z-depth, metres, (N,)
+    distance: Float32Array  # along the ray, metres, (N,)
 
 
 def facing_normals(mesh: Mesh, triangle: NDArray[np.int64], rays: Float32Array) -> Float32Array:

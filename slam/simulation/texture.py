@@ -17,23 +17,14 @@ _SIZE = 256  # lattice cells before the noise repeats
 
 @dataclass(frozen=True)
 class Texels:
-    """Texture coordinates of the pixels of one material; every field is ``(N,)``, metres.
+    """Texture coordinates of the pixels of one material; every field is ``(N,)``, metres."""
 
-    Attributes:
-        u: along the surface.
-        v: across or up the surface.
-        u_size: footprint of the pixel along u.
-        v_size: footprint of the pixel along v.
-        shift: offset of the instance in the noise along u.
-        shift_v: the same along v.
-    """
-
-    u: Float32Array
-    v: Float32Array
-    u_size: Float32Array
-    v_size: Float32Array
-    shift: Float32Array
-    shift_v: Float32Array
+    u: Float32Array  # along the surface
+    v: Float32Array  # across or up the surface
+    u_size: Float32Array  # footprint of the pixel along u
+    v_size: Float32Array  # footprint of the pixel along v
+    shift: Float32Array  # offset of the instance in the noise along u
+    shift_v: Float32Array  # the same along v
 
 
 @functools.cache
@@ -72,9 +63,7 @@ def cell_hash(u: Float32Array, v: Float32Array, salt: int) -> Float32Array:
 def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Array:
     """Sum of noise octaves, each faded out where its waves are smaller than about two pixels.
 
-    Args:
-        texels: texture coordinates.
-        octaves: wavelength along u, wavelength along v (metres), amplitude.
+    An octave is the wavelength along u and along v in metres, and the amplitude.
     """
     total = np.zeros_like(texels.u)
     for k, (wave_u, wave_v, amplitude) in enumerate(octaves):
@@ -181,11 +170,6 @@ def _wood(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     return mix(colours[0] * (1.0 + veins) * (1.0 - 0.6 * gaps), colours[1], knobs)
 
 
-def _fabric(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    grain = fractal(texels, (0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12))
-    return np.asarray(colours[0] * (1.0 + grain))
-
-
 def _books(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     """Rows of spines of all colours between boards; the upper part of a row is dark."""
     width, height, row = parameters[:3]
@@ -249,25 +233,12 @@ def _carton(texels: Texels, colours: Float32Array, parameters: Float32Array) -> 
     return rgb * (1.0 - 0.35 * _rim(texels, width, height, 0.008))
 
 
-def _lamp(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    return np.asarray(colours[0], dtype=np.float32)
-
-
 Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
 
 
 def shade(material: Material, texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """Unlit colour of some pixels of one material.
-
-    Args:
-        material: of all of them.
-        texels: where they look, ``(N,)`` each.
-        colours: the two base colours of their instances, ``(2, 3, N)``.
-        parameters: of their instances, ``(PARAMETERS, N)``.
-
-    Returns:
-        RGB, about [0, 1], ``(3, N)``.
-    """
+    """Unlit RGB ``(3, N)``, about [0, 1], of texels of one material, by the two colours ``(2, 3, N)`` and the
+    parameters ``(PARAMETERS, N)`` of their instances."""
     return _SHADERS[material](texels, colours, parameters)
 
 
@@ -322,6 +293,15 @@ def _mottled(*octaves: tuple[float, float, float]) -> Shader:
     def shader(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
         fraction = np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2)
         return mix(colours[0], colours[1], fraction)
+
+    return shader
+
+
+def _grained(*octaves: tuple[float, float, float]) -> Shader:
+    """One colour under noise."""
+
+    def shader(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
+        return np.asarray(colours[0] * (1.0 + fractal(texels, *octaves)))
 
     return shader
 
@@ -385,10 +365,6 @@ def _roof(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     return np.asarray(colours[0] * (1.0 + grain - 0.3 * rows - 0.15 * tiles))
 
 
-def _metal(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    return np.asarray(colours[0] * (1.0 + fractal(texels, (0.5, 1.3, 0.25), (0.2, 0.4, 0.2))))
-
-
 def _sign(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     half, kind = parameters[0], parameters[1]
     x, y, size = texels.u - half, texels.v - half, np.maximum(texels.u_size, texels.v_size)
@@ -443,7 +419,7 @@ _SHADERS: dict[Material, Shader] = {
     Material.ROOF: _roof,
     Material.BARK: _mottled((0.12, 0.6, 0.5), (0.4, 1.5, 0.4)),
     Material.LEAVES: _mottled((1.6, 1.6, 0.4), (0.55, 0.55, 0.6), (0.2, 0.2, 0.5)),
-    Material.METAL: _metal,
+    Material.METAL: _grained((0.5, 1.3, 0.25), (0.2, 0.4, 0.2)),
     Material.SIGN: _sign,
     Material.PAINT: _paint,
     Material.GLASS: _glass,
@@ -454,11 +430,11 @@ _SHADERS: dict[Material, Shader] = {
     Material.BOARDS: _boards,
     Material.CARPET: _carpet,
     Material.WOOD: _wood,
-    Material.FABRIC: _fabric,
+    Material.FABRIC: _grained((0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12)),
     Material.BOOKS: _books,
     Material.PICTURE: _picture,
     Material.SCREEN: _screen,
     Material.PANE: _pane,
     Material.CARTON: _carton,
-    Material.LAMP: _lamp,
+    Material.LAMP: _grained(),
 }

@@ -173,10 +173,7 @@ class _Town:
     def _furnish(self, start: FloatArray, end: FloatArray) -> None:
         """Trees, lamps and signs along one kerb, which has its block on the left, and cars in front of it."""
         rng = self.rng
-        length = float(np.linalg.norm(end - start))
-        ahead = (end - start) / max(length, 1e-9)
-        inward = np.array([-ahead[1], ahead[0]])
-        angle = float(np.arctan2(ahead[1], ahead[0]))
+        length, ahead, inward, angle = _directed(start, end)
         along = 6.0
         while along < length - 6.0:
             spot = start + along * ahead + float(rng.uniform(0.55, 1.0)) * inward
@@ -195,12 +192,11 @@ class _Town:
                 objects.car(self.soup, rng, objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)))
             along += float(rng.uniform(5.4, 7.5))
         if self.more is not None:
-            self._furnish_more(self.more, start, ahead, length)
+            self._furnish_more(self.more, start, end)
 
-    def _furnish_more(self, rng: np.random.Generator, start: FloatArray, ahead: FloatArray, length: float) -> None:
+    def _furnish_more(self, rng: np.random.Generator, start: FloatArray, end: FloatArray) -> None:
         """A railing along a part of the kerb, thin posts, and people on the pavement."""
-        inward = np.array([-ahead[1], ahead[0]])
-        angle = float(np.arctan2(ahead[1], ahead[0]))
+        length, ahead, inward, angle = _directed(start, end)
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
             foot = start + first * ahead + float(rng.uniform(0.2, 0.8)) * inward
@@ -232,10 +228,7 @@ class _Town:
         corners = [np.array(corner) for corner in ((low[0], low[1]), (high[0], low[1]), high, (low[0], high[1]))]
         for side in (side for side in range(4) if sides[side]):
             start, end = corners[side], corners[(side + 1) % 4]
-            length = float(np.linalg.norm(end - start))
-            ahead = (end - start) / length
-            inward = np.array([-ahead[1], ahead[0]])
-            angle = float(np.arctan2(ahead[1], ahead[0]))
+            length, ahead, inward, angle = _directed(start, end)
             frame = objects.frame_at(start[0], start[1], angle, KERB)
             for _ in range(int(rng.poisson(0.15 * wood * length))):
                 far = 15.0 * rng.random() ** 1.5
@@ -324,12 +317,18 @@ class _Town:
         corners = [np.array(c) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
         for side in range(4):
             start, end = corners[side], corners[(side + 1) % 4]
-            ahead = (end - start) / np.linalg.norm(end - start)
-            outward = np.array([ahead[1], -ahead[0]])
-            for along in np.arange(0.0, float(np.linalg.norm(end - start)), 9.0):
-                spot = start + (along + rng.uniform(-3, 3)) * ahead + rng.uniform(6.0, 25.0) * outward
+            length, ahead, inward, _ = _directed(start, end)
+            for along in np.arange(0.0, length, 9.0):
+                spot = start + (along + rng.uniform(-3, 3)) * ahead - rng.uniform(6.0, 25.0) * inward
                 if rng.random() < (1.0 if self.open else 0.7):
                     objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(6.0, 13.0)))
                 else:
                     frame = objects.frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)
                     objects.building(self.soup, rng, frame, float(rng.uniform(8, 14)), float(rng.uniform(7, 11)))
+
+
+def _directed(start: FloatArray, end: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
+    """Length of an edge in the plan, its direction ``(2,)``, the one to its left, and its angle from east."""
+    length = float(np.linalg.norm(end - start))
+    ahead = (end - start) / max(length, 1e-9)
+    return length, ahead, np.array([-ahead[1], ahead[0]]), float(np.arctan2(ahead[1], ahead[0]))

@@ -15,38 +15,21 @@ _SHARES = (0.3, 0.15, 0.35, 0.2)
 
 @dataclass(frozen=True)
 class Variety:
-    """One varied street and its camera.
+    """One varied street and its camera."""
 
-    Attributes:
-        kind: of street.
-        steepness: of hills at most, rise over run.
-        wavelength_m: of hills.
-        fov_deg: of the camera, horizontal.
-        aspect: width over height of the camera's own image, which is shrunk to the size that is asked for;
-            None if the size is the camera's own.
-        centre: of the lens beside the middle of the image, shares of its width and height.
-        height_m: of the camera above the road at rest.
-        pitch: of the camera, downwards, radians.
-        roll: of the camera about its axis, clockwise, radians.
-        bonnet: share of the image's height that shows the car's own bonnet; 0 shows none.
-        vignette: share of the light that the corners of the image lack.
-        noise: of the sensor, standard deviation as a share of white.
-        blur_px: of the lens, standard deviation.
-    """
-
-    kind: StreetKind
-    steepness: float
-    wavelength_m: float
-    fov_deg: float
-    aspect: float | None
-    centre: tuple[float, float]
-    height_m: float
-    pitch: float
-    roll: float
-    bonnet: float
-    vignette: float
-    noise: float
-    blur_px: float
+    kind: StreetKind  # of street
+    steepness: float  # of hills at most, rise over run
+    wavelength_m: float  # of hills
+    fov_deg: float  # of the camera, horizontal
+    aspect: float | None  # of the camera's own image, which is shrunk to the size asked for; None: of that size
+    centre: tuple[float, float]  # of the lens beside the middle of the image, shares of its width and height
+    height_m: float  # of the camera above the road at rest
+    pitch: float  # of the camera, downwards, radians
+    roll: float  # of the camera about its axis, clockwise, radians
+    bonnet: float  # share of the image's height that shows the car's own bonnet; 0 shows none
+    vignette: float  # share of the light that the corners of the image lack
+    noise: float  # of the sensor, standard deviation as a share of white
+    blur_px: float  # of the lens, standard deviation
 
     def intrinsics(self, width: int, height: int) -> FloatArray:
         """Camera matrix of images of this size, ``(3, 3)``."""

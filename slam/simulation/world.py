@@ -20,21 +20,13 @@ FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 
 @dataclass(frozen=True)
 class SimulatedFrame:
-    """One frame with its truth.
+    """One frame with its truth."""
 
-    Attributes:
-        index: number of the frame.
-        stamp: seconds.
-        image: ``(H, W, 3)`` uint8 RGB.
-        depth: z-depth in metres, 0 where nothing was hit, ``(H, W)`` float32.
-        T_world_camera: pose in the frame of the first camera, ``(4, 4)``.
-    """
-
-    index: int
-    stamp: float
-    image: NDArray[np.uint8]
-    depth: Float32Array
-    T_world_camera: FloatArray
+    index: int  # number of the frame
+    stamp: float  # seconds
+    image: NDArray[np.uint8]  # (H, W, 3) uint8 RGB
+    depth: Float32Array  # z-depth in metres, 0 where nothing was hit, (H, W) float32
+    T_world_camera: FloatArray  # pose in the frame of the first camera, (4, 4)
 
 
 class SimulatedWorld(ABC):

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from erfsfm.cli import app
 from erfsfm.inference import DepthPosePredictor
 from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.options import parse_options
+from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 SMALL = ("steps=2", "batch=2", "validate_every=2")
@@ -20,7 +20,7 @@ SMALL_DATA = ("workers=0", "validation_share=0.45", "validation_snippets=1")
 
 @pytest.mark.slow
 def test_own_fine_tunes_default_on_any_drive(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    street = SimulatedStreet(parse_options("straight", 44, 77, 416, 128, "", False))
+    street = SimulatedStreet(SimulationOptions("straight", 44, 77))
     write_kitti_root(street, tmp_path / "drive")
     settings = [f"training.{each}" for each in SMALL] + [f"data.{each}" for each in SMALL_DATA]
     command = ["train", "--config", "own", "--dataset", str(tmp_path / "drive"), "--output", str(tmp_path / "own")]

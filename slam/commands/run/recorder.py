@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from contextlib import suppress
-from dataclasses import asdict
 
 from erfsfm.common.errors import explained
 from erfsfm.common.progress import Progress, silent
@@ -14,7 +13,6 @@ from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image
-from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
@@ -108,7 +106,7 @@ class FolderRecorder(Recorder):
             pieces = lambda: (Ply(piece).points for piece in surface.cloud_pieces())  # noqa: E731
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
-        sizes = asdict(estimate.map.statistics())
+        sizes = estimate.map.statistics()
         found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
         self._metrics = self._metrics.changed(map=found)
 
@@ -166,5 +164,4 @@ class FolderRecorder(Recorder):
             except SlamError:
                 return next((each.image for each in estimate.drive.keyframes if each.index == index), None)
 
-        thresholds = OF_KEYFRAMES if estimate.drive.maps else OF_FRAMES
-        return loop_pictures(estimate.loops.accepted, image, sequence.intrinsics, thresholds)
+        return loop_pictures(estimate.loops.accepted, image, sequence.intrinsics)

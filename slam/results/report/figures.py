@@ -10,7 +10,7 @@ from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.spatial.transform import Rotation
 
-from slam.evaluation.drift import aligned, paired, segment_drifts
+from slam.evaluation.drift import FIGURE_LENGTHS_M, aligned, paired, segment_errors
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
 from slam.results.metrics import AcceptedLoop, Stretch
@@ -112,15 +112,14 @@ def drift_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
     """Relative errors over the length of segments, after the 7-dof alignment."""
     figure = _panels("translation (%)", "rotation (deg / 100 m)")
     for name, estimate, truth in paired(trajectories):
-        drifts = segment_drifts(estimate, truth)
-        lengths = np.array([drift.length_m for drift in drifts])
-        percent = np.array([100.0 * drift.translation for drift in drifts])
-        degrees = np.rad2deg([100.0 * drift.rotation for drift in drifts])
-        line = _line(name, lengths, percent, None, "%{y:.2f} % of %{x} m", mode="lines+markers")
-        figure.add_trace(line, 1, 1)
+        segments = segment_errors(estimate.T_world_camera, truth.T_world_camera, FIGURE_LENGTHS_M)
+        lengths = np.array([each.length_m for each in segments])
+        percent = 100.0 * np.array([each.translation_m.mean() for each in segments]) / lengths
+        degrees = 100.0 * np.rad2deg([each.rotation.mean() for each in segments]) / lengths
+        look = {"mode": "lines+markers"}
+        figure.add_trace(_line(name, lengths, percent, None, "%{y:.2f} % of %{x} m", **look), 1, 1)
         words = "%{y:.3f} deg / 100 m over %{x} m"
-        line = _line(name, lengths, degrees, None, words, mode="lines+markers", showlegend=False)
-        figure.add_trace(line, 2, 1)
+        figure.add_trace(_line(name, lengths, degrees, None, words, showlegend=False, **look), 2, 1)
     figure.update_xaxes(title="segment length (m)", row=2)
     return figure.update_yaxes(rangemode="tozero")
 

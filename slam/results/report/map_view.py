@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.formats.ply import Ply, map_ply
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH
 
-_CHUNK = 1_000_000  # triangles at a time
 _COARSER = 1.15  # vertices of one surface do not all meet in its cells
 _FINER = 2  # triangles that quadric errors choose from, as a multiple of those that stay
 _MOST_TRIANGLES = 1_000_000  # that are thinned by quadric errors; a larger mesh is clustered first
@@ -66,48 +64,22 @@ def map_view(folder: RunFolder, triangles: int) -> MapView | None:
 
 
 def thinned_mesh(path: Path, triangles: int) -> MapMesh:
-    """A ``map_mesh.ply`` with at most about so many triangles: vertices of cells put together, then quadric errors.
+    """A ``map_mesh.ply`` with at most about so many triangles, by quadric errors; a large one is clustered first.
 
     Raises:
         RunError: it is no mesh that can be read.
     """
-    vertices, faces = map_ply(path)
-    if len(faces) > max(_MOST_TRIANGLES, _FINER * triangles):
-        mesh = _clustered(vertices, faces["vertices"], _FINER * triangles)
-    else:
-        ply = Ply(vertices)
-        mesh = MapMesh(ply.points, ply.colours_or_grey, faces["vertices"].astype(np.int64))
-    if len(mesh.triangles) <= triangles:
-        return mesh
-    o3d = import_open3d()
-    vector = o3d.utility.Vector3dVector
-    whole = o3d.geometry.TriangleMesh(vector(mesh.points), o3d.utility.Vector3iVector(mesh.triangles.astype(np.int32)))
-    whole.vertex_colors = vector(mesh.colours / 255.0)
-    few = whole.simplify_quadric_decimation(triangles).remove_degenerate_triangles().remove_unreferenced_vertices()
-    colours = np.rint(255.0 * np.clip(np.asarray(few.vertex_colors), 0.0, 1.0)).astype(np.uint8)
-    return MapMesh(np.asarray(few.vertices), colours, np.asarray(few.triangles).astype(np.int64))
-
-
-def _clustered(vertices: NDArray[np.void], corners: NDArray[Any], triangles: int) -> MapMesh:
-    """One vertex a cell: the mean of those inside, and of their colours. Fields are read one by one, to save memory."""
-    some = Ply(vertices[corners[:: max(len(corners) // _CHUNK, 1)].ravel()]).points.reshape(-1, 3, 3)
-    edges = some[:, 1:] - some[:, :1]
-    area = 0.5 * float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).mean()) * len(corners)
-    cell = _COARSER * float(np.sqrt(2.0 * area / triangles)) or 1.0
-    keys = np.zeros(len(vertices), np.int64)  # of cells, 21 bits an axis
-    for axis in "xyz":
-        values = vertices[axis].astype(np.float64)
-        keys = (keys << 21) | np.minimum((values - values.min()) / cell, 2**21 - 1).astype(np.int64)
-    unique, cells = np.unique(keys, return_inverse=True)
-    counts = np.bincount(cells)
-
-    def means(fields: tuple[str, ...]) -> FloatArray:
-        return np.stack([np.bincount(cells, vertices[field], len(unique)) / counts for field in fields], axis=1)
-
-    pieces = (cells[corners[start : start + _CHUNK]] for start in range(0, len(corners), _CHUNK))
-    flat = [piece[(np.diff(np.sort(piece, axis=1), axis=1) > 0).all(axis=1)] for piece in pieces]
-    colours = np.rint(means(("red", "green", "blue"))).astype(np.uint8)
-    return MapMesh(means(("x", "y", "z")), colours, np.unique(np.concatenate(flat), axis=0).astype(np.int64))
+    mesh = import_open3d().io.read_triangle_mesh(str(path))
+    if not mesh.has_triangles():
+        raise RunError(f"{path} is no mesh that can be read: run the sequence again")
+    if len(mesh.triangles) > max(_MOST_TRIANGLES, _FINER * triangles):
+        mesh = mesh.simplify_vertex_clustering(_COARSER * np.sqrt(2.0 * mesh.get_surface_area() / (_FINER * triangles)))
+    if len(mesh.triangles) > triangles:
+        mesh = mesh.simplify_quadric_decimation(triangles)
+        mesh = mesh.remove_degenerate_triangles().remove_unreferenced_vertices()
+    colours = np.asarray(mesh.vertex_colors) if mesh.has_vertex_colors() else np.full_like(mesh.vertices, 0.5)
+    rgb = np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
+    return MapMesh(np.asarray(mesh.vertices), rgb, np.asarray(mesh.triangles).astype(np.int64))
 
 
 def _depths(points: FloatArray, T_world_camera: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -12,24 +11,20 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
-from erfsfm.common.table import Table
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.metrics import METRES, LoopsFile, Metrics
+from slam.results.metrics import METRES, AcceptedLoop, LoopsFile, Metrics
 from slam.results.report import tables
 from slam.results.report.map_view import MapView
 from slam.results.report.verdict import verdict
 from slam.results.tables import alignments_table, errors_table, missing_errors
-from slam.runtime.errors import RunError, SlamError
+from slam.runtime.errors import SlamError
 from slam.runtime.run_files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.storage.record import NOT_RECORDED
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
-
-logger = logging.getLogger(__name__)
 
 _ALIGNED = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
 _AS_WRITTEN = "As written; no ground truth is known. The raw network chain is scaled to the rest."
@@ -76,51 +71,32 @@ def write_report(
         metrics: of the run; None reads ``metrics.json``.
 
     Raises:
-        RunError: ``metrics.json`` is damaged.
+        RunError: a file of the folder is damaged.
     """
     metrics = metrics or folder.metrics()
     said, errors = verdict(metrics), metrics.evaluated_errors()
-    no_errors, has_map = missing_errors(errors), metrics.map.triangles is not None
-    optimised = metrics.trajectories.optimised
+    no_errors, optimised = missing_errors(errors), metrics.trajectories.optimised
+    found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
+    drawn = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
+    accepted = LoopsFile.read(folder.path / LOOPS).accepted or [] if (folder.path / LOOPS).is_file() else []
+    no_map = metrics.map.absent or ("" if metrics.map.triangles is not None else metrics.map.why("triangles"))
     page = _TEMPLATES.get_template("page.html.j2").render(
         script=(files("slam.results.report") / "page.js").read_text("utf-8"),
         plotly=_plotly,
-        name=metrics.sequence.name or folder.path.resolve().name,
-        failure=metrics.failure,
+        tables=tables,
+        folder=folder,
+        metrics=metrics,
         verdict=said,
-        leak=metrics.provenance.leak is True,
-        version=metrics.provenance.version or "",
-        unit_notes=metrics.unit_notes(),
-        key_numbers=[] if said is None else tables.key_numbers(metrics, has_map=not said.scraps),
-        what_ran=_html(tables.what_ran(metrics)),
-        plots=_plots(metrics, _trajectories(folder), _loops_file(folder), view),
-        errors=_html(errors_table(errors) if errors and not no_errors else None),
-        alignments=_html(alignments_table(optimised) if not optimised.absent and not no_errors else None),
+        plots=_plots(metrics, drawn, accepted, view),
+        errors=errors_table(errors) if errors and not no_errors else None,
+        alignments=alignments_table(optimised) if not optimised.absent and not no_errors else None,
         no_errors=no_errors,
-        gps=_html(tables.gps(metrics)),
         depths=depths,
-        depth_error=_html(tables.depth_error(metrics)),
-        map_tables=_html(tables.map_errors(metrics)) + _html(tables.map_left_out(metrics)),
-        no_map=_absence(metrics, metrics.map.absent or ("" if has_map else metrics.map.why("triangles"))),
-        loops=tables.loop_counts(metrics),
+        no_map=_absence(metrics, no_map),
         loop_pictures=loops,
         no_loops=_absence(metrics, metrics.loops.absent),
-        timing=_html(tables.timing(metrics)),
-        files=_html(tables.files(folder)),
     )
     folder.write_text(REPORT, page)
-
-
-def _html(table: Table | None) -> Markup:
-    return Markup("" if table is None else table.html())
-
-
-def _loops_file(folder: RunFolder) -> LoopsFile:
-    """``loops.json``; empty where the file is missing or damaged."""
-    try:
-        return LoopsFile.read(folder.path / LOOPS)
-    except (OSError, RunError):
-        return LoopsFile()
 
 
 def _absence(metrics: Metrics, reason: str) -> str:
@@ -128,18 +104,8 @@ def _absence(metrics: Metrics, reason: str) -> str:
     return "" if metrics.failure and reason == NOT_RECORDED else reason
 
 
-def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
-    """The trajectories to draw, the reference first; none if a file is damaged, so that the report is still written."""
-    try:
-        found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
-    except SlamError as error:
-        logger.info("the report shows no trajectories: %s", error)
-        return {}
-    return {name: trajectory for name, trajectory in found.items() if trajectory is not None}
-
-
 def _plots(
-    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: LoopsFile, view: MapView | None
+    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: Sequence[AcceptedLoop], view: MapView | None
 ) -> dict[str, list[Picture]]:
     """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
     from slam.results.report import figures
@@ -156,9 +122,9 @@ def _plots(
 
     has_truth = REFERENCE in trajectories and len(trajectories) > 1
     unit = "m" if metrics.unit == METRES else metrics.unit
-    gaps, accepted = metrics.sequence.bridged or [], loops.accepted or []
+    gaps = metrics.sequence.bridged or []
     if trajectories:
-        given = (trajectories, "m" if has_truth else unit, accepted)
+        given = (trajectories, "m" if has_truth else unit, loops)
         caption = _ALIGNED if has_truth else _AS_WRITTEN
         add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
     if has_truth:

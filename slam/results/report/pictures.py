@@ -8,12 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Image, Intrinsics, View
-from slam.frontend.visual.residuals import Residuals
-from slam.geometry.epipolar import UnitRelativePose
-from slam.geometry.se3 import invert
-from slam.loops.descriptors import FeatureExtractor
-from slam.loops.verification import Loop, LoopThresholds, matches
+from slam.frames import Image, Intrinsics
+from slam.loops.verification import Loop
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.page import Picture
 
@@ -49,16 +45,13 @@ class DepthPictures:
         return found
 
 
-def loop_pictures(
-    loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics, thresholds: LoopThresholds
-) -> list[Picture]:
-    """Some loops, spread over the drive: both images with the corners that match under the measured motion.
+def loop_pictures(loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics) -> list[Picture]:
+    """Some loops, spread over the drive: both images with lines between the corners that measured the loop.
 
     Args:
         loops: accepted ones.
         image: of a frame; None where it is gone, as those of a live drive are. Such loops are left out.
         intrinsics: of the recording; images may be smaller.
-        thresholds: of matches.
     """
     found = []
     ordered = sorted(loops, key=lambda loop: loop.ends[::-1])
@@ -67,37 +60,19 @@ def loop_pictures(
         if best is not None:
             first, second = (image(index) for index in best.ends)
             if first is not None and second is not None:
-                found.append(_pair(best, first, second, intrinsics, thresholds))
+                title = f"Frames {best.ends[0]} and {best.ends[1]}: {best.inliers} inliers"
+                found.append(_picture(_joined(first, second, best.pixels * (_WIDTH_PX / intrinsics.width)), title))
     return found
 
 
-def _pair(loop: Loop, first: Image, second: Image, intrinsics: Intrinsics, thresholds: LoopThresholds) -> Picture:
-    views = []
-    for index, image in zip(loop.ends, (first, second)):
-        camera = intrinsics.resized(image.shape[1], image.shape[0])
-        pixels, descriptors = FeatureExtractor(camera).corners(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        views.append((camera, View(index, pixels, descriptors, np.empty((0, 3), np.float32))))
-    (camera_first, view_first), (camera_second, view_second) = views
-    rows_first, rows_second = matches(view_first, view_second, thresholds)
-    from_, to = view_first.pixels[rows_first], view_second.pixels[rows_second]
-    T_second_first = invert(loop.measured.T_from_to)
-    motion = UnitRelativePose(T_second_first[:3, :3], T_second_first[:3, 3])  # of any length
-    rays_first, rays_second = camera_first.rays(from_), camera_second.rays(to)
-    residuals = Residuals(rays_first, rays_second, np.full(len(from_), np.nan), camera_first.fx)
-    kept = np.abs(residuals.across(motion, np.eye(3, 2))[0]) < thresholds.reprojection_px
-    drawn = np.flatnonzero(kept)[:: max(1, -(-int(kept.sum()) // _MOST_LINES))]
-    title = f"Frames {loop.ends[0]} and {loop.ends[1]}: {loop.inliers} inliers"
-    return _picture(_joined(first, second, from_[drawn], to[drawn]), title)
-
-
-def _joined(first: Image, second: Image, from_: NDArray[np.float32], to: NDArray[np.float32]) -> Image:
-    """Both images, wide ones below each other, with a line for every corner ``(M, 2)``."""
+def _joined(first: Image, second: Image, ends: NDArray[np.floating]) -> Image:
+    """Both images, wide ones below each other, with a line for every corner ``(M, 2, 2)``, some of very many."""
     wide = first.shape[1] > 2 * first.shape[0]
     left, right = _narrow(first, _WIDTH_PX), _narrow(second, _WIDTH_PX)
     joined = np.ascontiguousarray(np.vstack([left, right]) if wide else np.hstack([left, right]))
-    starts = from_ * (_WIDTH_PX / first.shape[1])
-    ends = to * (_WIDTH_PX / second.shape[1]) + ([0, left.shape[0]] if wide else [_WIDTH_PX, 0])
-    for k, line in enumerate(np.rint(np.stack([starts, ends], axis=1)).astype(int).tolist()):
+    shift = np.array([[0, 0], [0, left.shape[0]] if wide else [_WIDTH_PX, 0]])
+    ends = (ends + shift)[:: max(1, -(-len(ends) // _MOST_LINES))]
+    for k, line in enumerate(np.rint(ends).astype(int).tolist()):
         cv2.line(joined, line[0], line[1], _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
         for place in line:
             cv2.circle(joined, place, 2, _LINES[k % len(_LINES)], 1, cv2.LINE_AA)

@@ -22,13 +22,8 @@ _POINT_VOXELS = 0.25  # radius of a map point in voxels
 def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
     """Write ``.rrd``: on the timeline ``frame`` the camera with image and depth, over all time trajectories and map.
 
-    The world is that of the optimised trajectory, y down. Images and depth are those of keyframes,
-    thinned; depth is in the unit of the trajectory.
-
-    Args:
-        path: the file.
-        result: of a whole run.
-        intrinsics: of the sequence's images.
+    The world is that of the optimised trajectory, y down. Images, of these ``intrinsics``, and depth, in the unit of
+    the trajectory, are those of keyframes, thinned.
 
     Raises:
         SlamError: rerun is not installed, or the file cannot be written.

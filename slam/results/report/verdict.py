@@ -36,15 +36,11 @@ def verdict(metrics: Metrics) -> Verdict | None:
     """What the numbers say; None of a run that did not end well."""
     if metrics.failure:
         return None
-    found: tuple[list[str], list[str]] = [], []
     scraps = _scraps(metrics)
-    for part in (_confidence, _loops, _agreement, _unit, _noise, _frames, _map):
-        for is_sign, words in part(metrics):
-            found[0 if is_sign else 1].append(words)
-    if scraps:
-        found[1].append(scraps)
-    confirmed = next((words for is_sign, words in _loops(metrics) if is_sign), "")
-    return Verdict(_sentence(metrics, confirmed), *found, scraps)
+    said = [*_confidence(metrics), *_loops(metrics), *_agreement(metrics), *_unit(metrics), *_noise(metrics)]
+    said += [*_frames(metrics), *_map(metrics), *([(False, scraps)] if scraps else [])]
+    signs, doubts = ([words for is_sign, words in said if is_sign == wanted] for wanted in (True, False))
+    return Verdict(_sentence(metrics), signs, doubts, scraps)
 
 
 def percent(share: float) -> str:
@@ -52,23 +48,22 @@ def percent(share: float) -> str:
     return f"{100 * share:.2g} %" if abs(share) < 0.1 else f"{100 * share:.0f} %"
 
 
-def _sentence(metrics: Metrics, confirmed: str) -> str:
+def _sentence(metrics: Metrics) -> str:
     align, length = metrics.trajectories.optimised.align, metrics.sequence.length_m
     error = (align.dof6 if metrics.is_metric else align.dof7).ate_rmse_m
+    unit = "are in camera heights over the learned road, not in metres"
+    unit = f"its lengths {unit if metrics.unit == CAMERA_HEIGHTS else 'have no metric unit'}"
     if error is None:
-        means = "its lengths are in metres" if metrics.is_metric else _no(metrics.unit)
         sure = metrics.confidence.run
         likely = f": {percent(sure)} of drives like it err by at most 1 % of their path" if sure is not None else ""
-        return f"Without a truth its error is unknown{likely}{f', and {confirmed}' if confirmed else ''}; {means}."
+        closed = next((f", and {words}" for is_sign, words in _loops(metrics) if is_sign), "")
+        unit = "its lengths are in metres" if metrics.is_metric else unit
+        return f"Without a truth its error is unknown{likely}{closed}; {unit}."
     part = f", {percent(error / length)} of its {length:.3g} m" if length else ""
-    own = "with its scale from the truth" if metrics.scale.mode == "reference" else "with its own metric scale"
-    after = own if metrics.is_metric else f"after one fitted scale; {_no(metrics.unit)}"
+    after = f"after one fitted scale; {unit}"
+    if metrics.is_metric:
+        after = "with its scale from the truth" if metrics.scale.mode == "reference" else "with its own metric scale"
     return f"The trajectory is {error:.2g} m off the truth (RMSE{part}), {after}."
-
-
-def _no(unit: str) -> str:
-    measured = "are in camera heights over the learned road, not in metres"
-    return f"its lengths {measured if unit == CAMERA_HEIGHTS else 'have no metric unit'}"
 
 
 def _unit(metrics: Metrics) -> Iterator[tuple[bool, str]]:
@@ -82,14 +77,11 @@ def _unit(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 
 
 def _loops(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    accepted, candidates = metrics.loops.accepted, metrics.loops.candidates
+    accepted = metrics.loops.accepted
     if accepted:
-        yield (
-            True,
-            f"{accepted} of {_count(metrics.loops.verified or accepted, 'measured loop')} agree and close it",
-        )
+        yield True, f"{accepted} of {_count(metrics.loops.verified or accepted, 'measured loop')} agree and close it"
     elif accepted == 0:
-        yield False, f"no loop closes it ({candidates} candidates), so drift adds up"
+        yield False, f"no loop closes it ({metrics.loops.candidates} candidates), so drift adds up"
     else:
         yield False, f"drift adds up: {metrics.loops.why('accepted')}"
 
@@ -117,25 +109,21 @@ def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 
 def _noise(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     coverage = metrics.graph.coverage
-    inside = (coverage.inside_50, coverage.inside_90, coverage.inside_95)
-    shares = [each for each in inside if each is not None]
+    shares = [each for each in (coverage.inside_50, coverage.inside_90, coverage.inside_95) if each is not None]
     if len(shares) == 3:
-        off = [share - promised for share, promised in zip(shares, (0.5, 0.9, 0.95))]
+        worst = max((share - promised for share, promised in zip(shares, (0.5, 0.9, 0.95))), key=abs)
+        how = "holds" if abs(worst) < _NOISE_POINTS else "is too small" if worst < 0 else "is too large"
         told = ", ".join(f"{100 * share:.0f}" for share in shares)
         numbers = f"{told} % of its measurements lie inside their 50, 90, 95 % bounds"
-        worst = min(off, key=lambda each: -abs(each))
-        how = "holds" if abs(worst) < _NOISE_POINTS else "is too small" if worst < 0 else "is too large"
         yield how == "holds", f"its stated noise {how}: {numbers}"
 
 
 def _frames(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    sequence = metrics.sequence
-    if doubled := sum(each.last - each.first + 1 for each in sequence.doubled or ()):
+    if doubled := sum(each.last - each.first + 1 for each in metrics.sequence.doubled or ()):
         yield False, f"{_count(doubled, 'frame')} repeat the one before while the camera moves"
     if (maps := metrics.tracking.maps or 1) > 1:
-        lost = ", ".join(
-            str(event.frame) for event in metrics.tracking.events or () if event.frame and "begun" in event.event
-        )
+        events = [event for event in metrics.tracking.events or () if event.frame and "begun" in event.event]
+        lost = ", ".join(str(event.frame) for event in events)
         yield False, f"tracking was lost{f' at frames {lost}' if lost else ''}: {maps} maps are not joined"
     if metrics.provenance.leak is True:
         yield False, "LEAK: its weights saw this sequence, or a part of it, in training"

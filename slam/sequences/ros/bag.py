@@ -126,7 +126,10 @@ class Bag:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             foreign = foreign_topics(self.path) if self.path.suffix == ".mcap" else []
             if foreign:
-                raise SequenceError(f"{self.path} is not of ROS: it holds {', '.join(foreign)}; convert it") from error
+                held = ", ".join(foreign)
+                raise SequenceError(
+                    f"{self.path} is not of ROS: it holds {held}; convert it to a bag of ROS 2"
+                ) from error
             raise SequenceError(f"bag {self.path} cannot be read ({reason}): copy it again, or reindex it") from error
 
 

@@ -2,9 +2,6 @@
 
 import json
 import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors
-from slam.evaluation.trajectory import ALIGNMENTS, align, exceeded, trajectory_metrics
+from slam.evaluation.trajectory import ALIGNMENTS, AlignedMetrics, exceeded, trajectory_metrics
 from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 
-A_KEYS = {"ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale"}
+A_KEYS = set(AlignedMetrics.names())
 SHAPE = {
     "snippet5": {"ate_mean", "ate_std", "re_mean", "re_std", "count"},
     "evo": {"ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference"},
@@ -61,18 +58,6 @@ def ate(metrics: dict[str, Any]) -> dict[str, float | None]:
 def metrics_of(*given: Any, **named: Any) -> dict[str, Any]:
     """T as ``metrics.json`` has it."""
     return trajectory_metrics(*given, **named).tree()
-
-
-def test_a_perfect_estimate() -> None:
-    metrics = metrics_of(trajectory(drive()), trajectory(drive()))
-    check_shape(metrics)
-    for record in metrics["align"].values():
-        assert record["scale"] == pytest.approx(1.0)
-        assert {key: record[key] for key in A_KEYS - {"scale"}} == pytest.approx(
-            dict.fromkeys(A_KEYS - {"scale"}, 0.0), abs=1e-6
-        )
-    assert metrics["snippet5"]["count"] == 396
-    assert metrics["evo"]["difference"] < 1e-6
 
 
 def test_a_known_similarity_under_each_alignment() -> None:
@@ -142,11 +127,6 @@ def test_without_a_reference_every_number_has_a_reason() -> None:
     assert given["snippet5"] == {"ate_mean": 0.1, "ate_std": 0.2, "re_mean": 0.3, "re_std": 0.4, "count": 5}
 
 
-def test_direct_snippets_replace_cut_ones() -> None:
-    metrics = metrics_of(trajectory(drive(10)), trajectory(drive(10)), SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
-    assert metrics["snippet5"]["ate_mean"] == 0.1
-
-
 def test_an_estimate_that_stands_still_has_no_scale() -> None:
     metrics = metrics_of(trajectory(np.tile(drive(3)[2], (300, 1, 1))), trajectory(drive(300)))
     check_shape(metrics)
@@ -201,33 +181,18 @@ def test_one_and_two_frames(frames: int, known: set[str]) -> None:
     assert metrics["snippet5"]["ate_mean_reason"] == "a snippet needs 5 frames"
 
 
-def test_a_lost_estimate_is_no_number() -> None:
-    lost = drive(20)
-    lost[11, 0, 3] = np.nan
-    metrics = metrics_of(trajectory(lost), trajectory(drive(20)))
-    check_shape(metrics)
-    assert "not finite" in metrics["align"]["none"]["ate_rmse_m_reason"]
-
-
 @pytest.mark.parametrize(
     ("estimate", "truth", "alignment", "reason"),
     [
         (line(20, 0.0), line(20, 0.0), "none", "neither the estimate nor the reference moves"),
         (line(20, -1.0), line(20), "scale", "the other way"),
+        (np.where(np.arange(20)[:, None, None] == 11, np.nan, line(20)), line(20), "none", "not finite"),
     ],
 )
 def test_what_has_no_error_has_a_reason(estimate: FloatArray, truth: FloatArray, alignment: str, reason: str) -> None:
     metrics = metrics_of(trajectory(estimate), trajectory(truth))
     check_shape(metrics)
     assert reason in metrics["align"][alignment]["ate_rmse_m_reason"]
-
-
-def test_align_gives_trajectories_to_draw() -> None:
-    truth = drive(50)
-    estimate = se3.Similarity(0.1, np.eye(3), np.ones(3)).apply_to_poses(truth)
-    aligned = align(estimate, truth, "7dof")
-    np.testing.assert_allclose(aligned.T_world_estimate, truth, atol=1e-10)
-    assert aligned.scale == pytest.approx(10.0)
 
 
 def test_limits() -> None:
@@ -245,54 +210,20 @@ def test_limits() -> None:
     assert lines[1].startswith("align.7dof.t_rel_percent is not known (no segment of 100 m")
 
 
-def test_evo_writes_nothing_to_the_home_folder(tmp_path: Path) -> None:
-    program = (
-        "import sys, numpy as np\n"
-        "from slam.evaluation.trajectory import trajectory_metrics\n"
-        "from slam.formats.trajectory import Trajectory\n"
-        "assert 'evo' not in sys.modules and 'torch' not in sys.modules\n"
-        "T = np.tile(np.eye(4), (9, 1, 1)); T[:, :3, 3] = np.random.rand(9, 3)\n"
-        "t = Trajectory(np.arange(9.0), T)\n"
-        "assert trajectory_metrics(t, t).evo.difference < 1e-6\n"
-        "assert 'evo' in sys.modules\n"
-    )
-    environment = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("sequence", "alignment", "t_rel", "r_rel", "ate_m", "rpe_m", "rpe_deg"),
+    ("sequence", "alignment", "expected"),
     [
-        ("09", "6dof", 2.607, 0.288, 10.880, 0.056, 0.037),
-        ("09", "7dof", 2.528, 0.288, 10.729, 0.054, 0.037),
-        ("10", "6dof", 2.293, 0.369, 3.721, 0.047, 0.043),
-        ("10", "7dof", 2.221, 0.369, 3.356, 0.047, 0.043),
+        ("09", "6dof", [10.880, 2.607, 0.288, 0.056, 0.037]),
+        ("09", "7dof", [10.729, 2.528, 0.288, 0.054, 0.037]),
+        ("10", "6dof", [3.721, 2.293, 0.369, 0.047, 0.043]),
+        ("10", "7dof", [3.356, 2.221, 0.369, 0.047, 0.043]),
     ],
 )
-def test_golden_numbers(
-    golden: dict[str, Any],
-    sequence: str,
-    alignment: str,
-    t_rel: float,
-    r_rel: float,
-    ate_m: float,
-    rpe_m: float,
-    rpe_deg: float,
-) -> None:
+def test_golden_numbers(golden: dict[str, Any], sequence: str, alignment: str, expected: list[float]) -> None:
     """DF-VO's stereo-trained trajectories, as kitti-odom-eval scores them, to every printed digit."""
     record = golden[sequence]["align"][alignment]
-    rounded = {key: round(record[key], 3) for key in A_KEYS - {"scale"}}
-    assert rounded == {
-        "t_rel_percent": t_rel,
-        "r_rel_deg_per_100m": r_rel,
-        "ate_rmse_m": ate_m,
-        "rpe_trans_m": rpe_m,
-        "rpe_rot_deg": rpe_deg,
-    }
+    assert [round(record[key], 3) for key in AlignedMetrics.names()[:5]] == expected
     assert golden[sequence]["evo"]["difference"] < 1e-6
 
 

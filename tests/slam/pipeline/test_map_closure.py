@@ -11,14 +11,12 @@ import room
 from slam.config.sections import KeyframesConfig, SlamConfig
 from slam.frames import LOOP_SOURCE, RelativePose, View
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.loops.closure import LoopClosures, find_loops
 from slam.loops.consistency import Track
-from slam.loops.verification import Loop, RejectedLoop
+from slam.loops.verification import Loop
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
@@ -148,29 +146,6 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
     assert [each.frame for each in tracking.events if each.event == "relocalised"] == relocalised
 
 
-def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
-    strict = replace(map_closure.OF_KEYFRAMES, min_support=99, alone_inliers=10_000)
-    monkeypatch.setattr(map_closure, "OF_KEYFRAMES", strict)
-    truth, state = lost_on_the_way()
-    after = closed(state)
-    unit = MeasurementFailure("no road")
-    loops = after.closures(Scale("none", unit, np.full(len(truth), 3.0), {}, "the networks' own unit"))
-    measured = [loop for loop in loops.rejected if loop.T_from_to is not None]
-    assert loops.accepted == () and len(measured) > 3
-    poses = after.poses
-    learned = [pose.scaled(poses.learned_units[poses.segments[pose.to_index]]) for pose in poses.poses]
-    lengths = {pose.ends: np.linalg.norm(pose.T_from_to[:3, 3]) for pose in learned}
-    true = {(a, b): np.linalg.norm(truth[a, :3, 3] - truth[b, :3, 3]) for a, b in lengths}
-    units = [length / true[ends] for ends, length in lengths.items() if ends[0] < 30]
-    ratios = []
-    for loop in measured:
-        assert loop.T_from_to is not None
-        T = invert(truth[loop.from_index]) @ truth[loop.to_index]
-        ratios.append(np.linalg.norm(loop.T_from_to[:3, 3]) / np.linalg.norm(T[:3, 3]))
-    assert np.median(ratios) == pytest.approx(3.0 * np.median(units), rel=0.03)
-    assert np.mean(np.isclose(ratios, 3.0 * np.median(units), rtol=0.1)) > 0.8
-
-
 @pytest.mark.slow
 def test_another_scene_is_no_loop() -> None:
     walked = there_and_back(110)
@@ -178,16 +153,6 @@ def test_another_scene_is_no_loop() -> None:
     assert after.loops.accepted == ()
     assert after.joins == ()
     assert len(set(after.poses.segments.values())) == 2
-
-
-def test_a_rejected_loop_from_a_map_without_poses_has_a_length() -> None:
-    loop = RejectedLoop(0, 5, "few corners", 0.5, 9, from_rotation_vector(np.zeros(3), np.ones(3)))
-    scale = Scale("none", MeasurementFailure("no road"), np.full(6, 3.0), {}, "the networks' own unit")
-    (rejected,) = (
-        MapClosure(KeyframePoses(), LoopClosures(rejected=(loop,)), learned_units={0: 2.0}).closures(scale).rejected
-    )
-    assert rejected.T_from_to is not None
-    np.testing.assert_array_equal(rejected.T_from_to[:3, 3], 6.0)
 
 
 @pytest.mark.data

@@ -342,7 +342,7 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
     assert {f.ends for f in result.factors if f.source == "network"} == {(k, k + 1) for k in range(24)}
     assert len(seen.road_steps) > 10 and result.scale.lengths.keys() == seen.steps.triangulated.keys()
-    assert result.map is not None and result.map.statistics().triangles > 5000
+    assert result.map is not None and result.map.statistics()["triangles"] > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
 
 
@@ -353,7 +353,7 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt)
     nearness = np.median([np.median(depth[depth > 0]) for depth in depths]) / street.camera_height_m
     assert result.map is not None
     assert result.map.voxel_size == pytest.approx(0.2 * nearness / 15.0, rel=0.15)
-    assert result.map.statistics().triangles > 5000
+    assert result.map.statistics()["triangles"] > 5000
 
 
 def test_depth_is_thinned_for_the_map(street: Excerpt, monkeypatch: pytest.MonkeyPatch) -> None:

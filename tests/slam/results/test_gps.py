@@ -35,4 +35,4 @@ def test_the_recorded_track_of_a_drive(data_root: Path, tmp_path: Path) -> None:
     assert abs(metrics["gps"]["origin"]["heading_deg"] - 345) < 3
     origin = metrics["gps"]["origin"]
     assert [origin["longitude_deg"], origin["latitude_deg"]] == pytest.approx([8.43781, 49.01314], abs=1e-4)
-    assert "Beside GPS" in (folder.path / "report.html").read_text()
+    assert "of the GPS track" in (folder.path / "report.html").read_text()

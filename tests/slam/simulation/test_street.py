@@ -9,7 +9,7 @@ import yaml
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.options import SimulationOptions, parse_options
+from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 SMALL = {"width": 208, "height": 64}
@@ -67,7 +67,7 @@ def warp_error(street: SimulatedStreet, target: int, source: int) -> tuple[float
 
 @pytest.mark.parametrize("route", ["loop", "grid", "straight"])
 def test_poses_are_rigid_and_start_at_the_world(route: str) -> None:
-    street = SimulatedStreet(parse_options(route, 300, 702, 208, 64, ""))
+    street = SimulatedStreet(SimulationOptions(route, 300, 702, 208, 64))
     assert len(street) == 300 and street.T_world_camera.shape == (300, 4, 4)
     assert np.array_equal(street.T_world_camera[0], np.eye(4))
     assert se3.is_se3(street.T_world_camera, 1e-9)
@@ -97,7 +97,7 @@ def test_grid_is_revisited_in_both_directions() -> None:
 
 @pytest.mark.parametrize("route", ["loop", "grid", "straight"])
 def test_camera_keeps_clear_of_everything_and_above_the_road(route: str) -> None:
-    street = SimulatedStreet(parse_options(route, 300, 708, 208, 64, ""))
+    street = SimulatedStreet(SimulationOptions(route, 300, 708, 208, 64))
     positions = street.T_world_camera[:, :3, 3]
     assert street.distance_to_surface(positions).min() > 0.25
     below = positions + street.camera_height_m * street.T_world_camera[:, :3, 1]

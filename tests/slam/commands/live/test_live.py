@@ -22,12 +22,11 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live.reader import Reader, StreamedSequence
+from slam.commands.live.reader import Reader
 from slam.commands.live.run import LiveRequest, run_live
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
-from slam.sequences.camera_file import explicit_camera
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
 FRAMES = 14
@@ -250,14 +249,6 @@ def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:
         taken.append(int(arrival.image[0, 0, 0]))
         time.sleep(0.001)
     assert taken == list(range(20)) and reader.dropped == 0 and reader.ended == "the source ended"
-
-
-def test_only_a_source_that_is_stored_can_wait(street: Path) -> None:
-    source = FolderSource(street / "images", 1.0)
-    source.is_stored = False
-    camera = explicit_camera(Path("fov=70"), source, 10.0)
-    with pytest.raises(SequenceError, match="door does not wait while an image is measured: leave out --every-frame"):
-        StreamedSequence("door", source, camera, 1.0, every_frame=True)
 
 
 def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:

@@ -1,4 +1,4 @@
-"""A map is thinned without its whole mesh in memory, and stays the same surface."""
+"""A thinned map stays the same surface."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from slam.results.report.map_view import MapMesh, thinned_mesh
 
 
 @pytest.fixture
-def path(plain: Ply, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(slam.results.report.map_view, "_CHUNK", 1000)  # many pieces
+def path(plain: Ply, tmp_path: Path) -> Path:
     write_ply(tmp_path / "map_mesh.ply", plain)
     return tmp_path / "map_mesh.ply"
 

@@ -134,17 +134,13 @@ def test_the_first_sentence_says_how_good_it_is_and_why(make_run: MakeRun, make_
         return " ".join(" ".join(parsed(folder)[1].words).split())
 
     good = said()
-    assert "The trajectory is 2.6 m off the truth (RMSE, 0.87 % of its 299 m), with its own metric scale." in good
-    assert "For it: 1 of 3 measured loops agree and close it; metres come from the camera's height" in good
-    assert "its stated noise holds: 47, 88, 93 % of its measurements" in good
-    assert "Doubts: lengths are 11 % too short." in good
+    assert "2.6 m off the truth (RMSE, 0.87 % of its 299 m)" in good and "1 of 3 measured loops agree" in good
+    assert "47, 88, 93 % of its measurements" in good and "Doubts: lengths are 11 % too short." in good
     contradicted = [{"source": "lidar", "sigmas": 3.2, "figure": "its steps turn otherwise"}]
     doubtful = said(agreement=contradicted, loops={"candidates": 9, "verified": 0, "accepted": 0, "rejected": []})
-    assert "no loop closes it (9 candidates), so drift adds up" in doubtful
-    assert "lidar contradicts the images: its steps turn otherwise" in doubtful
+    assert "no loop closes it (9 candidates)" in doubtful and "lidar contradicts the images" in doubtful
     unknown = said(**make_metrics(reference=False, mode="none"), confidence={"run": 0.97})
-    assert "its error is unknown: 97 % of drives like it err by at most 1 % of their path" in unknown
-    assert "and 1 of 3 measured loops agree and close it; its lengths" in unknown
+    assert "its error is unknown: 97 % of drives like it" in unknown
     unsaid = said(confidence={"run": None, "run_reason": "the camera is carried"})
     assert "the camera is carried" in unsaid and "of drives" not in unsaid
 
@@ -191,13 +187,6 @@ def test_a_failed_run_has_its_reason(make_run: MakeRun) -> None:
     assert "frame 7 <is> broken" in balance.words
     assert "No trajectory was written" in html
     assert "FAILED" in html
-
-
-def test_a_damaged_loops_file_leaves_the_rest_of_the_report(make_run: MakeRun) -> None:
-    folder = make_run()
-    folder.write_text("loops.json", "{")
-    write_report(folder)
-    assert "12 candidates" in parsed(folder)[0]
 
 
 def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun) -> None:

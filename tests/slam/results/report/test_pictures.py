@@ -6,16 +6,14 @@ import base64
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from slam.frames import LOOP_SOURCE, RelativePose
-from slam.geometry.se3 import from_rotation_vector, invert
-from slam.loops.verification import OF_FRAMES, Loop
+from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
+from slam.loops.verification import Loop
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.page import Picture
 from slam.results.report.pictures import DepthPictures, loop_pictures
-from slam.sequences.simulated import SimulatedSequence
-from slam.simulation.options import SimulationOptions
 
 
 def pixels(picture: Picture) -> NDArray[np.uint8]:
@@ -24,26 +22,19 @@ def pixels(picture: Picture) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR))
 
 
-def test_lines_join_the_corners_that_fit_the_loop() -> None:
-    street = SimulatedSequence(SimulationOptions("straight", 40, 1002, 208, 64))
-    T_world_camera = street.reference
-    images = [street.frame(index).image for index in (4, 6)]
-    T_true = invert(T_world_camera[4]) @ T_world_camera[6]
-    turned = T_true @ from_rotation_vector(np.array([0.3, 0.0, 0.0]), np.zeros(3))
-
-    def drawn(T: NDArray[np.float64]) -> NDArray[np.uint8]:
-        loop = Loop(RelativePose(4, 6, T, np.full(6, 0.1), LOOP_SOURCE), 50, 0.9)
-        found = loop_pictures([loop], lambda index: images[(index - 4) // 2], street.intrinsics, OF_FRAMES)
-        assert [picture.title for picture in found] == ["Frames 4 and 6: 50 inliers"]
-        return pixels(found[0])
-
-    right, wrong = drawn(T_true), drawn(turned)
-    assert right.shape == wrong.shape == (2 * 148, 480, 3)
-    plain = np.vstack([cv2.resize(image[..., ::-1], (480, 148)) for image in images])
-    changed = [(np.abs(shown.astype(int) - plain).max(axis=-1) > 60).mean() for shown in (right, wrong)]
-    assert changed[0] > 4 * changed[1]
-    gone = loop_pictures([], lambda index: None, street.intrinsics, OF_FRAMES)
-    assert gone == []
+def test_lines_join_the_corners_of_the_loop() -> None:
+    first, second = (np.full((64, 208, 3), 128, np.uint8) for _ in range(2))
+    camera = Intrinsics(416, 128, 200.0, 200.0, 208.0, 64.0)  # of images twice as large
+    corners = np.array([[[104.0, 64.0], [312.0, 32.0]]], np.float32)
+    loop = Loop(RelativePose(4, 6, np.eye(4), np.full(6, 0.1), LOOP_SOURCE), 50, 0.9, pixels=corners)
+    (picture,) = loop_pictures([loop], {4: first, 6: second}.get, camera)
+    assert picture.title == "Frames 4 and 6: 50 inliers"
+    shown = pixels(picture).astype(int)
+    assert shown.shape == (2 * 148, 480, 3)
+    drawn = np.argwhere(np.abs(shown - 128).max(axis=-1) > 60)
+    assert drawn.min(axis=0) == pytest.approx([74, 120], abs=4)
+    assert drawn.max(axis=0) == pytest.approx([148 + 37, 360], abs=4)
+    assert loop_pictures([loop], {4: first}.get, camera) == []  # the image of a live drive is gone
 
 
 def test_near_is_bright_and_unknown_is_dark() -> None:

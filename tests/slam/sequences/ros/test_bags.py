@@ -214,7 +214,7 @@ def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_an_mcap_of_another_program_is_named_with_its_schema_and_encoding(tmp_path: Path) -> None:
+def test_an_mcap_of_another_program_is_named_and_converted_as_advised(tmp_path: Path, new_bag: NewBag) -> None:
     def record(kind: int, content: bytes) -> bytes:
         return struct.pack("<BQ", kind, len(content)) + content
 
@@ -227,8 +227,11 @@ def test_an_mcap_of_another_program_is_named_with_its_schema_and_encoding(tmp_pa
     channel = record(4, struct.pack("<HH", 1, 1) + text("/cam") + text("json") + struct.pack("<I", 0))
     footer = record(2, struct.pack("<QQI", len(start), 0, 0))
     (tmp_path / "walk.mcap").write_bytes(start + schema + channel + footer + magic)
-    with pytest.raises(SequenceError, match=r"not of ROS: it holds /cam \(foxglove.RawImage, json\)"):
+    with pytest.raises(SequenceError, match=r"holds /cam \(foxglove.RawImage, json\); convert it to a bag of ROS 2"):
         open_sequence(tmp_path / "walk.mcap")
+    converted = new_bag("mcap", "converted")
+    drive(converted)
+    assert len(open_sequence(converted.close())) == FRAMES
 
 
 def test_true_poses_of_a_tracker_in_tf(new_bag: NewBag, kind: str) -> None:

@@ -1,44 +1,76 @@
-"""The output folder of a run: ``--output``, or a new one in ``results``.
+"""Where a command may write: a new or empty folder, one of an earlier run, and files of the kind that it writes.
 
 Only files of a run are ever removed, and only from a folder whose ``metrics.json`` is that of a run.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
 from erfsfm.common.files import unfinished_name
+from slam.formats.trajectory import read_trajectory
 from slam.results.metrics import Metrics
-from slam.runtime.errors import RunError
-from slam.runtime.run_files import MEANINGS, METRICS
+from slam.runtime.errors import RunError, TrajectoryError
+from slam.runtime.run_files import ESTIMATE, MEANINGS, METRICS
 
 logger = logging.getLogger(__name__)
+
+_TRAJECTORIES = (".txt", ".tum", ".kitti")
+
+
+def check_replaced(path: Path, beginnings: Mapping[str, bytes] | None = None) -> None:
+    """Check what a file would replace.
+
+    Args:
+        path: the file to write.
+        beginnings: ends of the names that it may have, and how such files begin; None of any trajectory.
+
+    Raises:
+        RunError: a folder, a file of a run, or one of another kind.
+    """
+    if path.is_dir():
+        raise RunError(f"{path} is a folder: give the name of a file to write")
+    if path.name in MEANINGS and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
+        raise RunError(f"{path} is a file of a run: choose another --output")
+    if path.is_file() and path.stat().st_size and not _is_of_kind(path, beginnings):
+        raise RunError(f"{path} exists and is a file of another kind than is written: choose another --output")
+
+
+def _is_of_kind(path: Path, beginnings: Mapping[str, bytes] | None) -> bool:
+    suffix = path.suffix.lower()
+    if suffix not in (_TRAJECTORIES if beginnings is None else beginnings):
+        return False
+    if beginnings is not None:
+        with path.open("rb") as file:
+            return file.read(64).startswith(beginnings[suffix])
+    try:
+        read_trajectory(path)
+    except TrajectoryError:
+        return False
+    return True
 
 
 def check_output(output: Path) -> None:
     """Check that a run may write to ``output``: it is new, empty, or holds an earlier run.
 
     Raises:
-        RunError: it is a file, or holds files of something else, or a folder where a run has a file.
+        RunError: it is a file, or holds files of something else.
     """
     if output.is_symlink() and not output.exists():
-        raise RunError(
-            f"{output} is a link to {output.readlink()}, which is not there: make it, or choose another --output"
-        )
+        raise RunError(f"{output} is a link to {output.readlink()}, which is not there: choose another --output")
     if not output.exists():
         return
     if not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
     if not _is_run(output / METRICS) and any(not _is_rest(path) for path in output.iterdir()):
         raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
-    for path in output.iterdir():
-        if path.name in MEANINGS and path.is_dir():
-            raise RunError(f"{path} is a folder, where a run writes a file: move it away, or choose another --output")
 
 
 def claim(output: Path) -> None:
@@ -59,23 +91,14 @@ def stamped(results: Path, sequence: str) -> Path:
     """A new ``<stamp>_<sequence>`` in ``results``, with ``latest`` pointing to it."""
     safe = re.sub(r"[^\w.-]+", "-", sequence)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    path = results / f"{stamp}_{safe}"
     results.mkdir(parents=True, exist_ok=True)
-    number = 1
-    while not _made(path):
-        number += 1
-        path = results / f"{stamp}-{number}_{safe}"
+    for number in itertools.count(1):  # another run may begin in the same second
+        path = results / (f"{stamp}_{safe}" if number == 1 else f"{stamp}-{number}_{safe}")
+        with suppress(FileExistsError):
+            path.mkdir()
+            break
     _link(results / "latest", path)
     return path
-
-
-def _made(path: Path) -> bool:
-    """Make a folder, unless it is there: another run may begin in the same second."""
-    try:
-        path.mkdir()
-    except FileExistsError:
-        return False
-    return True
 
 
 def _is_run(metrics: Path) -> bool:

@@ -160,16 +160,8 @@ class StaticTransforms:
     """The tree of the frames of ``/tf_static``."""
 
     def __init__(self, bag: Bag) -> None:
-        """Read all static transforms, without bad ones; the last of a frame counts."""
-        self._parents: dict[str, tuple[str, FloatArray]] = {}
-        for message in bag.messages(_STATIC_TOPIC) if _STATIC_TOPIC in bag.types else ():
-            for each in message.transforms:
-                try:
-                    mount = frame_name(each.header.frame_id), transform_of(each.transform)
-                except ValueError as error:
-                    logger.warning("%s: the transform of %r is left out: %s", _STATIC_TOPIC, each.child_frame_id, error)
-                    continue
-                self._parents[frame_name(each.child_frame_id)] = mount
+        """Read all static transforms; the last of a frame counts."""
+        self._parents = {child: (parent, T) for parent, child, _, T in transforms(bag, _STATIC_TOPIC)}
 
     def between(self, a: str, b: str) -> FloatArray | None:
         """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
@@ -192,17 +184,26 @@ class StaticTransforms:
 def moving_frames(bag: Bag) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
     """Stamps ``(M,)`` and ``T_parent_child`` ``(M, 4, 4)`` of the frames of ``/tf``, by parent and child."""
     found: dict[tuple[str, str], dict[float, FloatArray]] = {}
-    for message in bag.messages(_MOVING_TOPIC) if _MOVING_TOPIC in bag.types else ():
+    for parent, child, stamp, T_parent_child in transforms(bag, _MOVING_TOPIC):
+        found.setdefault((parent, child), {}).setdefault(stamp, T_parent_child)
+    return {
+        frames: (np.array(sorted(poses)), np.stack([poses[stamp] for stamp in sorted(poses)]))
+        for frames, poses in found.items()
+    }
+
+
+def transforms(bag: Bag, topic: str) -> Iterator[tuple[str, str, float, FloatArray]]:
+    """Parent, child, stamp in seconds and ``T_parent_child`` ``(4, 4)`` of the good transforms of a topic of tf."""
+    for message in bag.messages(topic) if topic in bag.types else ():
         for each in message.transforms:
-            stamp = each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec
-            with suppress(ValueError):
-                frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
-                found.setdefault(frames, {}).setdefault(stamp, transform_of(each.transform))
-    moving = {}
-    for frames, poses in found.items():
-        stamps = sorted(poses)
-        moving[frames] = np.array(stamps), np.stack([poses[stamp] for stamp in stamps])
-    return moving
+            stamp = each.header.stamp
+            try:
+                T_parent_child = transform_of(each.transform)
+            except ValueError as error:
+                logger.warning("%s: the transform of %r is left out: %s", topic, each.child_frame_id, error)
+                continue
+            frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+            yield *frames, stamp.sec + 1e-9 * stamp.nanosec, T_parent_child
 
 
 def frame_name(text: str) -> str:

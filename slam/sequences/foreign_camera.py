@@ -45,7 +45,8 @@ def read_foreign_camera(path: Path, fps: float) -> CameraFile | None:
         content = read_text(path) if path.suffix == ".txt" else read_opencv_yaml(path)
     except (OSError, UnicodeDecodeError, ErfsfmError):
         return None  # for the reader of camera.yaml to say what is wrong
-    program, keys_of = "COLMAP", _colmap
+    program = "COLMAP"
+    keys_of: Callable[[Any], Keys] = _colmap
     if path.suffix != ".txt":
         mark = next((mark for mark in _PROGRAMS if isinstance(content, dict) and mark in content), None)
         if mark is None:

@@ -74,10 +74,11 @@ def find_series(kinds: Mapping[str, str]) -> list[list[Piece]]:
             drives.setdefault(piece.drive, []).append(piece)
     found = []
     for pieces in drives.values():
+        if len(pieces) < 2:
+            continue
         pieces.sort(key=lambda piece: piece.place)
         apart = np.diff([piece.place for piece in pieces])
-        pauses = np.flatnonzero(apart > _LONGEST_PAUSE * np.median(apart)) + 1 if len(apart) else []
-        cuts = [0, *pauses, len(pieces)]
+        cuts = [0, *(np.flatnonzero(apart > _LONGEST_PAUSE * np.median(apart)) + 1).tolist(), len(pieces)]
         found += [pieces[a:b] for a, b in pairwise(cuts) if b > a + 1]
     return found
 

@@ -32,7 +32,7 @@ from slam.results.tables import written
 from slam.runtime.errors import RunError, SequenceError, SlamError
 from slam.runtime.storage.files import from_anywhere, write_atomically
 from slam.sequences.catalogue import sequence_names
-from slam.sequences.excerpt import frame_range
+from slam.sequences.recording import frame_range
 
 CSV = "drives.csv"
 _MANIFEST = ".csv"

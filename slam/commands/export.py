@@ -69,8 +69,8 @@ def export(
         What was written.
 
     Raises:
-        SlamError: an option unknown or without effect, a part that the run lacks or that is damaged, images that are not
-            found, or a file that cannot be written.
+        SlamError: an option unknown or without effect, a part that the run lacks or that is damaged, missing images,
+            or a file that cannot be written.
     """
     if what not in get_args(What) or up not in R_UP_WORLDS:
         raise RunError(f"what is one of {', '.join(get_args(What))}, up {' or '.join(R_UP_WORLDS)}; got {what}, {up}")

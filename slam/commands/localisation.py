@@ -31,8 +31,8 @@ from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import PLACES
 from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
-from slam.sequences.excerpt import frame_range
 from slam.sequences.images import ImageFiles
+from slam.sequences.recording import frame_range
 from slam.sequences.undistortion import Undistortion, intrinsics_of
 
 _PLACES_TRIED = 8

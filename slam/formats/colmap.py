@@ -79,8 +79,14 @@ def write_colmap(
     of_frames = {k: rows for k, rows in sightings.of_frames().items() if k not in without_image}
     views = list(_views(T_world_camera, without_image, sightings, of_frames))
     points = list(_points(points_world, colours, sightings, of_frames))
-    text = _camera_text(intrinsics), _views_text(views), _points_text(points)
-    binary = [_camera_binary(intrinsics)], _views_binary(views), _points_binary(points)
+    width, height = intrinsics.width, intrinsics.height
+    pinhole = [
+        float(v) for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx + _HALF_PIXEL, intrinsics.cy + _HALF_PIXEL)
+    ]
+    camera = [_HEADER, f"1 PINHOLE {width} {height} {' '.join(map(repr, pinhole))}"]
+    text = camera, _views_text(views), _points_text(points)
+    packed = struct.pack("<QIiQQ4d", 1, 1, _PINHOLE, width, height, *pinhole)
+    binary = [packed], _views_binary(views), _points_binary(points)
     for name, lines, parts in zip(MODEL_FILES, text, binary, strict=True):
         _write(folder / BINARY_FOLDER / "0" / Path(name).with_suffix(".bin"), parts)
         _write(folder / name, (f"{line}\n".encode("ascii") for line in lines))
@@ -98,11 +104,6 @@ def _write(path: Path, parts: Iterable[bytes]) -> None:
             file.writelines(parts)
 
     write_atomically(path, fill, RunError)
-
-
-def _pinhole(camera: Intrinsics) -> list[float]:
-    principal = [camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
-    return [float(value) for value in (camera.fx, camera.fy, *principal)]
 
 
 def _views(
@@ -138,10 +139,6 @@ def _points(
         yield place, colour, error, tracks.get(k, [])
 
 
-def _camera_text(camera: Intrinsics) -> list[str]:
-    return [_HEADER, f"1 PINHOLE {camera.width} {camera.height} {' '.join(map(repr, _pinhole(camera)))}"]
-
-
 def _views_text(views: list[View]) -> Iterator[str]:
     yield "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of X Y POINT3D_ID"
     for k, pose, pixels, points in views:
@@ -155,10 +152,6 @@ def _points_text(points: list[Point]) -> Iterator[str]:
     for k, (place, colour, error, track) in enumerate(points):
         numbers = " ".join(f"{x:.9g}" for x in place), " ".join(map(str, colour)), f"{error:.4g}"
         yield " ".join((f"{k + 1}", *numbers, *(f"{image} {corner}" for image, corner in track)))
-
-
-def _camera_binary(camera: Intrinsics) -> bytes:
-    return struct.pack("<QIiQQ4d", 1, 1, _PINHOLE, camera.width, camera.height, *_pinhole(camera))
 
 
 def _views_binary(views: list[View]) -> Iterator[bytes]:

@@ -18,13 +18,8 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
 from slam.runtime.storage.files import write_atomically
 
-_TYPES = {
-    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
-    **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
-    **{"double": "f8", "float64": "f8"},
-}
-_NAMES = {"f8": "double", "f4": "float", "u1": "uchar", "i1": "char"}
-_NAMES |= {"u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"}
+_TYPES = {"double": "f8", "float": "f4", "uchar": "u1", "int": "i4", "uint": "u4"}  # that Open3D and we write
+_NAMES = {kind: name for name, kind in _TYPES.items()}
 _AXES, _NORMALS, _COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 _TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
 
@@ -59,10 +54,6 @@ class Ply:
         return np.full((len(self.vertices), 3), 128, np.uint8) if self.colours is None else self.colours
 
 
-_Element = tuple[str, int, list[tuple[Any, ...]]]
-"""Name, count and fields of an element of the header."""
-
-
 def read_ply(path: Path) -> Ply:
     """Read a whole file: every vertex, every triangle, and nothing after them.
 
@@ -71,14 +62,20 @@ def read_ply(path: Path) -> Ply:
     """
     parts = _mapped(path)
     vertices, faces = parts["vertex"], parts.get("face")
-    try:
-        if faces is not None and (faces["count"] != 3).any():
-            raise ValueError("a face has other than 3 vertices")
-        ply = Ply(np.array(vertices), None if faces is None else faces["vertices"].astype(np.int64))
-        _check(ply)
-        return ply
-    except (ValueError, KeyError) as error:
-        raise RunError(f"{path} is no PLY that can be read ({error}): run the sequence again") from error
+    ply = Ply(np.array(vertices), None if faces is None else faces["vertices"].astype(np.int64))
+    points, triangles = ply.columns(_AXES), ply.triangles
+    wrong = ""
+    if points is None:
+        wrong = "its vertices have no x, y, z"
+    elif not np.isfinite(points).all():
+        wrong = "a coordinate is not finite"
+    elif faces is not None and (faces["count"] != 3).any():
+        wrong = "a face has other than 3 vertices"
+    elif triangles is not None and triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+        wrong = "a triangle has a vertex that does not exist"
+    if wrong:
+        raise RunError(f"{path} is no PLY that can be read ({wrong}): run the sequence again")
+    return ply
 
 
 def _mapped(path: Path) -> dict[str, NDArray[np.void]]:
@@ -86,20 +83,22 @@ def _mapped(path: Path) -> dict[str, NDArray[np.void]]:
     parts: dict[str, NDArray[np.void]] = {}
     try:
         with path.open("rb") as file:
+            if file.readline() != b"ply\n":
+                raise ValueError("it does not begin with 'ply'")
             elements, place = _header(file), file.tell()
         size = path.stat().st_size
-        for name, count, fields in elements:
+        for name, (count, fields) in elements.items():
             dtype, start = np.dtype(fields), place
             place += count * dtype.itemsize
             if not start <= place <= size:
                 raise ValueError(f"it announces {count} elements '{name}', more than it holds")
             parts[name] = np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
-        if place < size or "vertex" not in parts:
+        corners = parts["face"].dtype.names if "face" in parts else ("vertices",)
+        if place < size or "vertex" not in parts or "vertices" not in (corners or ()):
             raise ValueError("it is longer than its header states, or has no vertices")
         return parts
-    except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
-        reason = str(error) or "it ends within its header"
-        raise RunError(f"{path} is no PLY that can be read ({reason}): run the sequence again") from error
+    except (OSError, ValueError, KeyError) as error:
+        raise RunError(f"{path} is no PLY that can be read ({error}): run the sequence again") from error
 
 
 def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
@@ -163,42 +162,21 @@ def write_ply_pieces(
     write_atomically(path, fill, RunError)
 
 
-def _check(ply: Ply) -> None:
-    points = ply.columns(_AXES)
-    if points is None:
-        raise ValueError("its vertices have no x, y, z")
-    if not np.isfinite(points).all():
-        raise ValueError("a coordinate is not finite")
-    triangles = ply.triangles
-    if triangles is not None and triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
-        raise ValueError("a triangle has a vertex that does not exist")
-
-
-def _header(file: BinaryIO) -> list[_Element]:
-    """The elements in their order; of a list as many values as a triangle has corners."""
-    lines = _words(file)
-    if next(lines) != ["ply"]:
-        raise ValueError("it does not begin with 'ply'")
-    _, form, _ = next(lines)
-    if form != "binary_little_endian":
-        raise ValueError(f"its format is {form}")
-    elements: list[_Element] = []
-    for words in lines:
-        if words[0] == "end_header":
-            break
-        if words[0] == "element":
-            elements.append((words[1], int(words[2]), []))
-        elif words[1] == "list":
-            elements[-1][2].extend([("count", f"<{_TYPES[words[2]]}"), ("vertices", f"<{_TYPES[words[3]]}", (3,))])
-        else:
-            elements[-1][2].append((words[2], f"<{_TYPES[words[1]]}"))
-    else:
-        raise ValueError("its header has no end")
-    return elements
-
-
-def _words(file: BinaryIO) -> Iterator[list[str]]:
+def _header(file: BinaryIO) -> dict[str, tuple[int, list[tuple[Any, ...]]]]:
+    """Count and fields of the elements by name; of a list as many values as a triangle has corners."""
+    elements: dict[str, tuple[int, list[tuple[Any, ...]]]] = {}
+    fields: list[tuple[Any, ...]] = []
     for line in file:
-        words = line.decode("ascii").split()
-        if words and words[0] not in ("comment", "obj_info"):
-            yield words
+        match line.decode("ascii").split():
+            case ["end_header"]:
+                return elements
+            case ["format", form, _] if form != "binary_little_endian":
+                raise ValueError(f"its format is {form}")
+            case ["element", name, count]:
+                fields = []
+                elements[name] = int(count), fields
+            case ["property", "list", count, corner, _]:
+                fields += [("count", f"<{_TYPES[count]}"), ("vertices", f"<{_TYPES[corner]}", (3,))]
+            case ["property", kind, name]:
+                fields.append((name, f"<{_TYPES[kind]}"))
+    raise ValueError("it ends within its header")

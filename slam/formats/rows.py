@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.files import read_text
 from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
@@ -45,13 +46,15 @@ class BadRows:
             self.add(line, reason)
         return tuple(column[good] for column in (lines, *columns))
 
-    def in_order(self, stamps: NDArray[np.float64], what: str, lines: NDArray[np.intp]) -> NDArray[np.intp]:
+    def in_order(
+        self, stamps: NDArray[np.float64], what: str, lines: NDArray[np.intp], wanted: str
+    ) -> NDArray[np.intp]:
         """The rows in the order of their stamps ``(N,)``, without repeated ones and those far from their place.
 
-        A row a few places late is sorted in, and so are all rows of a table in no order at all.
+        A row a few places late is sorted in, and so are all rows of a table in no order at all. Bad rows are said.
 
         Raises:
-            SlamError: more than a quarter of the rows would be left out.
+            SlamError: more than a quarter of the rows would be left out, or none is ``wanted`` (`say`).
         """
         order = np.argsort(stamps, kind="stable")
         has_no_order = len(order) > 1 and np.mean(np.diff(stamps) < 0) > 1 - _LEAST_IN_ORDER
@@ -63,6 +66,7 @@ class BadRows:
             line = int(lines[order[bad]].min())
             raise self._error(f"{self._path}, line {line}: {what} must increase; sort the rows, a series a file")
         good = order[~bad]
+        self.say(len(good), wanted)
         late = np.flatnonzero(np.diff(good) < 0)
         if len(late):
             line = int(lines[good[late + 1]].min())
@@ -88,6 +92,21 @@ class BadRows:
             logger.warning(
                 "%s: %d of %d rows are left out; line %d: %s", self._path, len(self._reasons), total, line, reason
             )
+
+
+def text_of(path: Path, error: type[SlamError], wanted: str) -> str:
+    """The text of a file that should hold what is ``wanted``.
+
+    Raises:
+        SlamError: the ``error``: it cannot be read.
+    """
+    try:
+        return read_text(path)
+    except FileNotFoundError as cause:
+        raise error(f"{path}: no such file; wanted {wanted}") from cause
+    except (OSError, UnicodeDecodeError) as cause:
+        reason = getattr(cause, "strerror", None) or "this is not a text file (UTF-8)"
+        raise error(f"{path}: {reason}; wanted {wanted}") from cause
 
 
 def is_number(word: str) -> bool:

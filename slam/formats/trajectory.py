@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from erfsfm.common.files import read_text
-from slam.formats.rows import BadRows, in_seconds, is_number
+from slam.formats.rows import BadRows, in_seconds, is_number, text_of
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
@@ -28,6 +27,7 @@ logger = logging.getLogger(__name__)
 _COLUMNS = {"kitti": (12, 13, 16, 17), "tum": (8, 7)}
 # a TartanAir camera looks along x, with y to the right and z down
 _T_TARTAN_CAMERA = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+_WANTED = "a pose a row"
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST = 1e12  # metres: to Saturn
@@ -128,7 +128,8 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     columns, good = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
     lines, rows, numbers = bad.without(good, "a number is not finite", lines, rows, numbers)
     if columns in _COLUMNS["kitti"]:
-        T_world_camera = _kitti_poses(numbers[:, columns % 4 :][:, :12])
+        T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
+        T_world_camera[:, :3] = numbers[:, columns % 4 :][:, :12].reshape(-1, 3, 4)
     else:
         good = np.asarray(np.abs(np.linalg.norm(numbers[:, -4:], axis=1) - 1.0) < _ROTATION_TOLERANCE)
         lines, rows, numbers = bad.without(good, "the quaternion does not have length 1", lines, rows, numbers)
@@ -148,8 +149,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     )
     timed, numbered = columns == 8, columns in (13, 17)
     stamps = numbers[:, 0] if timed or numbered else rows.astype(np.float64)
-    order = bad.in_order(stamps, "time stamps" if timed else "frame numbers", lines)
-    bad.say(len(order), "a pose a row")
+    order = bad.in_order(stamps, "time stamps" if timed else "frame numbers", lines, _WANTED)
     T_world_camera = T_world_camera[order]
     T_world_camera[:, :3, :3] = se3.nearest_rotation(T_world_camera[:, :3, :3])
     count = len(order) + len(bad) if len(bad) and not (timed or numbered) else None
@@ -299,7 +299,9 @@ def _read_numbers(
     path: Path, forms: tuple[int, ...], bad: BadRows
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Line and row numbers ``(N,)`` of a file, and its table ``(N, columns)`` of the commonest of these forms."""
-    table = list(_read_words(path))
+    text = text_of(path, TrajectoryError, _WANTED)
+    content = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
+    table = [(number, _words(line)) for number, line in content if line and not line.startswith("#")]
     if table and not any(is_number(word) for word in table[0][1]):
         del table[0]  # a header
     counts = Counter(len(words) for _, words in table)
@@ -309,43 +311,15 @@ def _read_numbers(
         if len(words) != columns:
             bad.add(line, _other_columns(len(words), columns if counts[columns] else forms[0], forms))
             continue
-        try:
-            numbers.append([_number(word) for word in words])
-        except ValueError as error:
-            bad.add(line, str(error))
+        odd = next((word for word in words if not is_number(word)), None)
+        if odd is not None:
+            hint = "; decimals are written with a point" if is_number(odd.replace(",", ".")) else ""
+            bad.add(line, f"not a number: {odd!r}{hint}")
             continue
+        numbers.append([float(word) for word in words])
         lines.append(line)
         rows.append(row)
     return np.array(lines, np.intp), np.array(rows, np.intp), np.array(numbers).reshape(-1, columns)
-
-
-def _number(word: str) -> float:
-    """Python's reading of a number, without its underscores.
-
-    Raises:
-        ValueError: it is none.
-    """
-    if not is_number(word):
-        hint = "; decimals are written with a point" if is_number(word.replace(",", ".")) else ""
-        raise ValueError(f"not a number: {word!r}{hint}")
-    return float(word)
-
-
-def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and words of each line that holds data."""
-    if path.is_dir():
-        raise TrajectoryError(f"{path}: this is a folder, not a trajectory file")
-    try:
-        text = read_text(path)
-    except FileNotFoundError as error:
-        raise TrajectoryError(f"{path}: no such file") from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path}: this is not a text file (UTF-8)") from error
-    except OSError as error:
-        raise TrajectoryError(f"{path}: {error.strerror}") from error
-    for line, content in enumerate(text.splitlines(), start=1):
-        if content.strip() and not content.lstrip().startswith("#"):
-            yield line, _words(content)
 
 
 def _words(line: str) -> list[str]:
@@ -367,12 +341,6 @@ def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:
         return f"{count} columns; a KITTI row has 12, a TUM row 8"
     other = {12: "; this looks like a KITTI row", 8: "; this looks like a TUM row"}.get(count, "")
     return f"{count} columns where {'KITTI' if wanted in _COLUMNS['kitti'] else 'TUM'} has {wanted}{other}"
-
-
-def _kitti_poses(numbers: FloatArray) -> FloatArray:
-    T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
-    T_world_camera[:, :3] = numbers.reshape(-1, 3, 4)
-    return T_world_camera
 
 
 def _row(values: Iterable[float]) -> str:

@@ -49,7 +49,7 @@ from slam.runtime.errors import SequenceError, SlamError
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
-from slam.sequences.excerpt import first_frames
+from slam.sequences.recording import RecordedSequence
 
 logger = logging.getLogger(__name__)
 
@@ -233,7 +233,8 @@ class SlamPipeline:
         if seen <= self._predictor.sources:
             raise SlamError(f"interrupted after {seen} frames, before the first snippet of the networks")
         logger.warning("interrupted: the run is of the first %d of %d frames", seen, total)
-        self.sequence = first_frames(self.sequence, seen)
+        assert isinstance(self.sequence, RecordedSequence)  # a live drive is what was seen
+        self.sequence = self.sequence.cut(0, seen)
         self.require_possible()
 
     def _completed(self, observed: Observations, closure: MapClosure) -> Drive:

@@ -14,7 +14,6 @@ from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
-from slam.sequences.excerpt import recording_of
 
 logger = logging.getLogger(__name__)
 
@@ -73,12 +72,10 @@ def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | Non
     Raises:
         SlamError: a depth map or a scan cannot be read.
     """
-    base, start = recording_of(sequence)
-    frame = start + index
-    if getattr(base, "street", None) is not None and count % _EVERY_RENDERED != 1:
+    if getattr(sequence, "street", None) is not None and count % _EVERY_RENDERED != 1:
         return None
-    if isinstance(base, HasTrueDepth) and frame in base.true_depth_frames():
-        return np.asarray(base.true_depth(frame), np.float32)
+    if isinstance(sequence, HasTrueDepth) and index in sequence.true_depth_frames():
+        return np.asarray(sequence.true_depth(index), np.float32)
     if sequence.T_camera_lidar is None or not sequence.has_scan(index):
         return None
     return projected(sequence.scan(index), sequence.T_camera_lidar, sequence.intrinsics)

@@ -75,12 +75,12 @@ def lidar_trajectory(result: Estimate) -> Trajectory | None:
 
 def timing_of(watch: Stopwatch, frames: int) -> records.Timing:
     """The time of a run until now."""
-    seconds, peak = watch.seconds, peak_rss_mb()
+    seconds = watch.seconds
     return records.Timing.of(
         seconds_total=seconds,
         frames_per_second=frames / seconds,
         cpu_seconds=watch.cpu_seconds,
-        peak_rss_mb=Failed("not available on Windows") if peak is None else peak,
+        peak_rss_mb=peak_rss_mb(),
         stages=dict(watch.stages),
     )
 

@@ -18,7 +18,6 @@ from slam.pipeline.estimate import Estimate
 from slam.results.metrics import MAP_ERRORS, MapMetrics
 from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
-from slam.sequences.excerpt import recording_of
 
 logger = logging.getLogger(__name__)
 
@@ -41,22 +40,21 @@ class HasTrueDepth(Protocol):
 class DepthTruth:
     """Depth maps at true poses; ``distance`` is exact where the surface itself is known."""
 
-    def __init__(self, sequence: Sequence, depth: HasTrueDepth, start: int) -> None:
-        """Depth of a sequence whose frame 0 is frame ``start`` of ``depth``."""
-        self._depth, self._start = depth, start
+    def __init__(self, sequence: Sequence, depth: HasTrueDepth) -> None:
+        """``depth`` is the sequence itself."""
+        self._depth = depth
         self._intrinsics, self._poses = sequence.intrinsics, sequence.reference
-        frames = np.asarray(depth.true_depth_frames(), dtype=np.int64) - start
-        self.frames: Indices = frames[(frames >= 0) & (frames < len(sequence))]
+        self.frames: Indices = np.asarray(depth.true_depth_frames(), dtype=np.int64)
         exact, T_any_camera = getattr(depth, "distance_to_surface", None), getattr(depth, "T_any_camera", None)
         self.name = "depth maps" if exact is None else "exact surface"
         self.distance: Callable[[FloatArray], FloatArray] | None = None
         if exact is not None and T_any_camera is not None:
-            self.distance = lambda points: exact(apply(T_any_camera[start], points))
+            self.distance = lambda points: exact(apply(T_any_camera[0], points))
 
     def view(self, frame: int) -> Surface:
         """Surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m."""
         assert self._poses is not None
-        depth = self._depth.true_depth(self._start + frame)
+        depth = self._depth.true_depth(frame)
         height, width = depth.shape
         camera = Intrinsics.of(self._intrinsics.resized(width, height))
         step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
@@ -138,9 +136,8 @@ def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     """The best truth of a sequence, or why there is none."""
     if sequence.reference is None:
         return "the sequence has no true poses"
-    base, start = recording_of(sequence)
-    if isinstance(base, HasTrueDepth):
-        depth = DepthTruth(sequence, base, start)
+    if isinstance(sequence, HasTrueDepth):
+        depth = DepthTruth(sequence, sequence)
         if len(depth.frames):
             return depth
     if sequence.T_camera_lidar is not None:

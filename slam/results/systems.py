@@ -20,7 +20,7 @@ from slam.results.tables import COLUMNS, UNITS, ErrorColumn, missing_notes, writ
 from slam.runtime.errors import RunError, TrajectoryError
 from slam.runtime.run_files import REFERENCE
 from slam.runtime.storage.files import write_atomically
-from slam.sequences.excerpt import frame_range
+from slam.sequences.recording import frame_range
 
 logger = logging.getLogger(__name__)
 

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import os
+import resource
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TypeVar
-
-if sys.platform != "win32":
-    import resource
-
 
 T = TypeVar("T")
 
@@ -22,7 +18,7 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
-        self._cpu_start = _cpu_seconds()
+        self._cpu_start = time.process_time()
         self.stages: dict[str, float] = {}
 
     @contextmanager
@@ -55,20 +51,13 @@ class Stopwatch:
     @property
     def cpu_seconds(self) -> float:
         """Processor seconds, user and system, since the start."""
-        return _cpu_seconds() - self._cpu_start
+        return time.process_time() - self._cpu_start
 
 
-def peak_rss_mb() -> float | None:
-    """Largest resident memory of this process so far, MiB; None on Windows, where Python has no `resource`."""
-    if sys.platform == "win32":
-        return None
+def peak_rss_mb() -> float:
+    """Largest resident memory of this process so far, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
-
-
-def _cpu_seconds() -> float:
-    times = os.times()
-    return times.user + times.system
 
 
 def return_freed_memory() -> None:

@@ -15,10 +15,10 @@ from typing import Any, Protocol
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError, sequence_errors
-from slam.sequences.foreign_camera import read_foreign_camera
+from slam.sequences.foreign_camera import pinhole_keys, read_foreign_camera
 
 DEFAULT_FPS = 10.0
-_FOV = re.compile(r"fov=(?P<fov>[\d.]+)(?:,fps=(?P<fps>[\d.]+))?")
+_FOV = re.compile(r"fov=(?P<fov>\d+\.?\d*)(?:,fps=(?P<fps>\d+\.?\d*))?")
 _FOV_LIMITS_DEG = (3.0, 150.0)
 
 
@@ -123,11 +123,8 @@ def is_field_of_view(given: Path) -> bool:
 def _of_field_of_view(text: str, images: Sized, fps: float) -> CameraFile:
     """A pinhole with square pixels and the principal point in the middle; the field is that of the whole width."""
     match = _FOV.fullmatch(text)
-    try:
-        fov_deg = float(match["fov"]) if match else math.nan
-        fps = float(match["fps"]) if match and match["fps"] else fps
-    except ValueError:
-        fov_deg = math.nan
+    fov_deg = float(match["fov"]) if match else math.nan
+    fps = float(match["fps"]) if match and match["fps"] else fps
     least, most = _FOV_LIMITS_DEG
     if not (least <= fov_deg <= most and fps > 0):
         raise SequenceError(
@@ -135,14 +132,6 @@ def _of_field_of_view(text: str, images: Sized, fps: float) -> CameraFile:
             f"right, {least:g} to {most:g}, or fov=70,fps=30 for 30 frames a second as well"
         )
     focal_px = images.width / 2 / math.tan(math.radians(fov_deg) / 2)
-    keys = {
-        "width": images.width,
-        "height": images.height,
-        "fx": focal_px,
-        "fy": focal_px,
-        "cx": (images.width - 1) / 2,
-        "cy": (images.height - 1) / 2,
-        "fps": fps,
-        "source": f"a horizontal field of view of {fov_deg:g} degrees",
-    }
-    return camera_of(keys, text)
+    width, height, source = images.width, images.height, f"a horizontal field of view of {fov_deg:g} degrees"
+    centre = (width - 1) / 2, (height - 1) / 2
+    return camera_of(pinhole_keys(width, height, focal_px, focal_px, *centre, fps=fps, source=source), text)

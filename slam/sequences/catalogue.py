@@ -11,15 +11,13 @@ from pathlib import Path
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.kitti_drives import drive_name, find_odometry_root
 from erfsfm.common.readers.video import VIDEO_SUFFIXES
-from slam.frames import Sequence
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.runtime.imports import import_plug_in, plug_ins
 from slam.sequences import folder, kitti, layouts
 from slam.sequences.camera_file import as_known
-from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import read_truth
-from slam.sequences.recording import RecordedSequence
+from slam.sequences.recording import RecordedSequence, frame_range
 from slam.sequences.ros import loader as ros
 from slam.sequences.series import find_series, open_series
 
@@ -49,7 +47,7 @@ def open_sequence(
     camera: Path | None = None,
     frames: str | None = None,
     truth: Path | None = None,
-) -> Sequence:
+) -> RecordedSequence:
     """Open a sequence of any kind.
 
     Args:
@@ -60,9 +58,6 @@ def open_sequence(
         camera: a ``camera.yaml``, or ``fov=DEGREES``; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
         truth: its true poses, in place of those that the data set has.
-
-    Returns:
-        The sequence, or the ``Excerpt`` of it.
 
     Raises:
         SequenceError: one line on what was searched, where, what was found and what to do.
@@ -77,12 +72,8 @@ def open_sequence(
         sequence = _choose(root, Asked(name, camera))
         sequence.intrinsics = as_known(sequence.intrinsics, camera)
     if truth is not None:
-        if not isinstance(sequence, RecordedSequence):
-            raise SequenceError(f"the loader of this recording takes no true poses: leave out --truth {truth}")
         sequence.take_truth(read_truth(truth, sequence.stamps))
-    if frames is None:
-        return sequence
-    return Excerpt(sequence, *frame_range(frames, len(sequence)))
+    return sequence if frames is None else sequence.cut(*frame_range(frames, len(sequence)))
 
 
 @sequence_errors()
@@ -100,7 +91,7 @@ def sequence_names(dataset: Path) -> list[str]:
     return list(sequence_kinds(dataset))
 
 
-def _open_embedded() -> SourcedSequence:
+def _open_embedded() -> RecordedSequence:
     # rendering needs Open3D, which is slow to import
     from slam.sequences.simulated import SimulatedSequence
     from slam.simulation.options import SimulationOptions
@@ -131,9 +122,9 @@ def _root(dataset: Path | None, name: str | None) -> Path:
 def _contents(root: Path, asked: Asked) -> dict[str, Found]:
     """What a path holds, pieces of one recording as one; empty where nothing is of a known kind."""
     found = _parts(root, asked)
-    for names in find_series({name: each.kind for name, each in found.items()}):
-        kind, openers = found[names[0]].kind, [found.pop(name).open for name in names]
-        found[names[0]] = Found(kind, partial(open_series, names, kind, openers))
+    for pieces in find_series({name: each.kind for name, each in found.items()}):
+        kind, openers = found[pieces[0].name].kind, [found.pop(piece.name).open for piece in pieces]
+        found[pieces[0].name] = Found(kind, partial(open_series, pieces, openers))
     return found
 
 
@@ -161,7 +152,7 @@ def _recognised(root: Path, asked: Asked) -> dict[str, Found]:
     return {}
 
 
-def _choose(root: Path, asked: Asked) -> SourcedSequence:
+def _choose(root: Path, asked: Asked) -> RecordedSequence:
     """Open the sequence by its name, or the only one."""
     contents, name = _contents(root, asked), asked.name
     if name is not None and name not in contents and not Path(name).is_absolute() and (root / name).exists():

@@ -45,20 +45,22 @@ def read_foreign_camera(path: Path, fps: float) -> CameraFile | None:
         content = read_text(path) if path.suffix == ".txt" else read_opencv_yaml(path)
     except (OSError, UnicodeDecodeError, ErfsfmError):
         return None  # for the reader of camera.yaml to say what is wrong
-    if path.suffix == ".txt":
-        try:
-            return camera_of(_with_source(_colmap(content), "COLMAP", fps), str(path))
-        except (IndexError, ValueError, StopIteration) as error:
-            raise DataError(f"{path} has no row 'CAMERA_ID MODEL WIDTH HEIGHT PARAMS...' of COLMAP: {error}") from error
-    if not isinstance(content, dict):
-        return None
-    for mark, (program, keys_of) in _PROGRAMS.items():
-        if mark in content:
-            try:
-                return camera_of(_with_source(keys_of(content), program, fps), str(path))
-            except (KeyError, IndexError, TypeError, ValueError) as error:
-                raise DataError(f"{path} looks like a calibration of {program}, but lacks {error}") from error
-    return None
+    program = "COLMAP"
+    keys_of: Callable[[Any], Keys] = _colmap
+    if path.suffix != ".txt":
+        mark = next((mark for mark in _PROGRAMS if isinstance(content, dict) and mark in content), None)
+        if mark is None:
+            return None
+        program, keys_of = _PROGRAMS[mark]
+    try:
+        keys = keys_of(content)
+        if not any(keys["distortion"]) and keys["model"] == "opencv":
+            keys["model"] = "pinhole"
+        if keys["model"] == "pinhole":
+            keys["distortion"] = []
+        return camera_of({"fps": fps, **keys, "source": f"a calibration of {program}"}, str(path))
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise DataError(f"{path} looks like a calibration of {program}, but lacks {error}") from error
 
 
 def read_opencv_yaml(path: Path) -> Any:
@@ -71,12 +73,6 @@ def read_opencv_yaml(path: Path) -> Any:
     return parse_yaml(text.partition("\n")[2].replace("!!opencv-matrix", "") if text.startswith("%") else text)
 
 
-def _with_source(keys: Keys, program: str, fps: float) -> Keys:
-    if keys["model"] == "pinhole" or (keys["model"] == "opencv" and not any(keys["distortion"])):
-        keys |= {"model": "pinhole", "distortion": []}
-    return {"fps": fps, **keys, "source": f"a calibration of {program}"}
-
-
 def lens_model(name: str | None) -> Literal["pinhole", "opencv", "fisheye"]:
     """The model of ``camera.yaml`` of a lens as another program names it; ``DataError`` where it is unknown."""
     if name not in LENSES:
@@ -84,36 +80,24 @@ def lens_model(name: str | None) -> Literal["pinhole", "opencv", "fisheye"]:
     return LENSES[name]
 
 
-def _pinhole(width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any) -> Keys:
-    return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+def pinhole_keys(width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any, **more: Any) -> Keys:
+    """The keys of ``camera.yaml`` for a camera, pixels, and ``more`` of them."""
+    return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **more}
 
 
-def _kalibr(content: Keys) -> Keys:
-    camera = content["cam0"]
-    if camera["camera_model"] != "pinhole":
-        raise DataError(f"Kalibr's camera_model {camera['camera_model']} is unknown: calibrate as pinhole")
-    keys = _pinhole(*camera["resolution"], *camera["intrinsics"])
-    return {
-        **keys,
-        "model": lens_model(camera.get("distortion_model")),
-        "distortion": camera.get("distortion_coeffs", []),
-    }
-
-
-def _euroc(content: Keys) -> Keys:
-    if content.get("camera_model", "pinhole") != "pinhole":
-        raise DataError(f"EuRoC's camera_model {content['camera_model']} is unknown: undistort the images")
-    keys = _pinhole(*content["resolution"], *content["intrinsics"])
-    lens = {
-        "model": lens_model(content.get("distortion_model")),
-        "distortion": content.get("distortion_coefficients", []),
-    }
-    return {**keys, **lens, **({"fps": content["rate_hz"]} if "rate_hz" in content else {})}
+def _kalibr(camera: Keys) -> Keys:
+    """Of Kalibr's ``cam0`` or EuRoC's ``sensor.yaml``."""
+    if camera.get("camera_model", "pinhole") != "pinhole":
+        raise DataError(f"the camera_model {camera['camera_model']} is unknown: calibrate as pinhole")
+    distortion = camera.get("distortion_coeffs", camera.get("distortion_coefficients", []))
+    keys = pinhole_keys(*camera["resolution"], *camera["intrinsics"], distortion=distortion)
+    rate = {"fps": camera["rate_hz"]} if "rate_hz" in camera else {}
+    return {**keys, **rate, "model": lens_model(camera.get("distortion_model"))}
 
 
 def _camera_info(content: Keys) -> Keys:
     fx, _, cx, _, fy, cy, *_ = content["camera_matrix"]["data"]
-    keys = _pinhole(content["image_width"], content["image_height"], fx, fy, cx, cy)
+    keys = pinhole_keys(content["image_width"], content["image_height"], fx, fy, cx, cy)
     distortion = content.get("distortion_coefficients", {}).get("data", [])
     return {**keys, "model": lens_model(content.get("distortion_model")), "distortion": distortion}
 
@@ -123,27 +107,30 @@ def _orb_slam(content: Keys) -> Keys:
     focal = (content[f"{prefix}.{name}"] for name in ("fx", "fy", "cx", "cy"))
     model = lens_model(content.get("Camera.type", "PinHole"))
     names = ("k1", "k2", "k3", "k4") if model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
-    keys = _pinhole(content["Camera.width"], content["Camera.height"], *focal)
+    keys = pinhole_keys(content["Camera.width"], content["Camera.height"], *focal)
     keys |= {"fps": content["Camera.fps"]} if "Camera.fps" in content else {}
     return {**keys, "model": model, "distortion": [content.get(f"{prefix}.{name}", 0.0) for name in names]}
 
 
 def _colmap(text: str) -> Keys:
     """Of the first row; COLMAP's (0.5, 0.5) is the centre of the first pixel."""
-    row = next(line.split() for line in text.splitlines() if line.strip() and not line.startswith("#"))
-    _, name, width, height, *words = row
-    if name not in _COLMAP:
-        raise DataError(f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}")
-    values = [*map(float, words), 0.0]
-    places, coefficients, model = _COLMAP[name]
-    fx, fy, cx, cy = (values[place] for place in places)
-    keys = _pinhole(int(width), int(height), fx, fy, cx - 0.5, cy - 0.5)
-    return {**keys, "model": model, "distortion": [values[place] for place in coefficients]}
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        _, name, width, height, *words = rows[0]
+        if name not in _COLMAP:
+            raise DataError(f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}")
+        places, coefficients, model = _COLMAP[name]
+        values = [*map(float, words), 0.0]
+        fx, fy, cx, cy = (values[place] for place in places)
+        distortion = [values[place] for place in coefficients]
+        return pinhole_keys(int(width), int(height), fx, fy, cx - 0.5, cy - 0.5, model=model, distortion=distortion)
+    except (IndexError, ValueError) as error:
+        raise ValueError("a row 'CAMERA_ID MODEL WIDTH HEIGHT PARAMS...'") from error
 
 
 _PROGRAMS: dict[str, tuple[str, Callable[[Keys], Keys]]] = {
-    "cam0": ("Kalibr", _kalibr),
-    "T_BS": ("EuRoC", _euroc),
+    "cam0": ("Kalibr", lambda content: _kalibr(content["cam0"])),
+    "T_BS": ("EuRoC", _kalibr),
     "camera_matrix": ("ROS", _camera_info),
     "Camera.fx": ("ORB-SLAM", _orb_slam),
     "Camera1.fx": ("ORB-SLAM", _orb_slam),

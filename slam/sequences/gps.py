@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable
 from functools import reduce
 from operator import xor
@@ -10,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.common.files import read_text
-from slam.formats.rows import BadRows, in_seconds
+from slam.formats.rows import BadRows, in_seconds, text_of
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -22,6 +22,7 @@ _EARTH_RADIUS_M = 6.371e6
 FASTEST_M_S = 300.0
 _LEAST_FIXES = 3  # one step may be an error of one fix
 _MOST = np.array([90.0, 180.0, 1e5])
+_NO_FIX = [math.nan] * 5
 
 
 def read_gps(path: Path) -> GpsTrack:
@@ -34,35 +35,24 @@ def read_gps(path: Path) -> GpsTrack:
     Raises:
         SequenceError: the file cannot be read or holds something else, with the row.
     """
-    try:
-        text = read_text(path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise SequenceError(f"{path} cannot be read as a GPS track: {reason}; give a file with --gps") from error
-    except UnicodeDecodeError as error:
-        raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
+    text = text_of(path, SequenceError, "a GPS track")
     lines = text.splitlines()
     try:
         found = _nmea_rows(lines) if text.lstrip().startswith("$") else _csv_rows(lines, path)
     except csv.Error as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
-    bad = BadRows(path, SequenceError)
-    good = []
-    for row, fix in found:
-        if _is_fix(fix):
-            good.append((row, fix))
-        else:
-            bad.add(row, "no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed")
-    table = np.array([fix for _, fix in good], dtype=np.float64).reshape(-1, 5)
     if not found:
         wrong = sum("*" in line and _sentence(line) == [""] for line in lines)
         raise SequenceError(
             f"{path} holds no GPS fix with an altitude: CSV with a header {','.join(_COLUMNS)}, or NMEA is read"
             + (f"; {wrong} sentences have a wrong checksum" if wrong else "")
         )
-    ordered = bad.in_order(table[:, 0], "stamps", np.array([row for row, _ in good], np.intp))
-    bad.say(len(ordered), "GPS fixes")
-    table = table[ordered]
+    bad, rows = BadRows(path, SequenceError), np.array([row for row, _ in found], np.intp)
+    table = np.array([fix for _, fix in found], dtype=np.float64)
+    is_fix = np.isfinite(table).all(axis=1) & (abs(table[:, 1:4]) <= _MOST).all(axis=1) & (table[:, 4] > 0)
+    needed = "no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed"
+    rows, table = bad.without(is_fix, needed, rows, table)
+    table = table[bad.in_order(table[:, 0], "stamps", rows, "GPS fixes")]
     _require_possible_speed(table, path)
     return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4])
 
@@ -82,7 +72,7 @@ def _require_possible_speed(table: FloatArray, path: Path) -> None:
 
 
 def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
-    """Lines with stamp, latitude, longitude, altitude, dilution; nothing where a row is none."""
+    """Lines with stamp, latitude, longitude, altitude, dilution; NaN where a row is none."""
     delimiter = max(",;\t", key=lines[0].count) if lines else ","
     reader = csv.DictReader(lines, skipinitialspace=True, delimiter=delimiter)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
@@ -94,7 +84,7 @@ def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
             stamp, *place = (row[name] for name in _COLUMNS)
             numbers = [float(word) for word in (in_seconds(stamp), *place, row.get("hdop") or 1.0)]
         except (TypeError, ValueError):
-            numbers = []
+            numbers = _NO_FIX
         rows.append((reader.line_num, numbers))
     return rows
 
@@ -102,7 +92,7 @@ def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
 def _nmea_rows(lines: Iterable[str]) -> list[tuple[int, list[float]]]:
     """The same of GGA sentences with a fix and its altitude; each receiver repeats a fix at most once a stamp."""
     rows: list[tuple[int, list[float]]] = []
-    before = -np.inf
+    before = -math.inf
     for number, line in enumerate(lines, start=1):
         words = _sentence(line)
         if words[0][-3:] != "GGA" or len(words) < 10 or words[6] in ("", "0") or not words[9]:
@@ -111,14 +101,13 @@ def _nmea_rows(lines: Iterable[str]) -> list[tuple[int, list[float]]]:
             stamp = _seconds(words[1])
             if stamp < before - _DAY_S / 2:
                 stamp += _DAY_S
-            fix = [stamp, _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])]
-            fix.append(float(words[8] or 1.0))
+            place = _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])
+            fix = [stamp, *place, float(words[8] or 1.0)]
         except ValueError:
-            fix = []
-        if fix and fix[0] == before:
-            continue
-        before = fix[0] if fix else before
-        rows.append((number, fix))
+            fix = _NO_FIX
+        if fix[0] != before:
+            rows.append((number, fix))
+        before = before if math.isnan(fix[0]) else fix[0]
     return rows
 
 
@@ -139,8 +128,3 @@ def _degrees(word: str, side: str) -> float:
     point = word.index(".") if "." in word else len(word)
     degrees = int(word[: point - 2]) + float(word[point - 2 :]) / 60.0
     return -degrees if side in ("S", "W") else degrees
-
-
-def _is_fix(numbers: list[float]) -> bool:
-    place: FloatArray = np.array(numbers[1:4])
-    return len(numbers) == 5 and bool(np.isfinite(numbers).all() and (abs(place) <= _MOST).all() and numbers[4] > 0)

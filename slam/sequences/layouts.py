@@ -23,13 +23,13 @@ from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import has_images, list_images
 from erfsfm.common.readers.kitti_sensors import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
-from slam.formats.rows import BadRows, in_seconds, number_or_nan
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, text_of
 from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, find_camera_file, read_explicit
-from slam.sequences.foreign_camera import read_opencv_yaml
+from slam.sequences.foreign_camera import pinhole_keys, read_opencv_yaml
 from slam.sequences.images import DepthMaps, ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import pose_files, poses_near, poses_of
@@ -86,22 +86,18 @@ def _recorded(
     return RecordedSequence(name, stored, camera, stamps, sources, **beside_images)
 
 
-def _index(table: Path, folder: Path, wanted: str, in_nanoseconds: bool = False) -> tuple[FloatArray, list[Path]]:
+def _index(table: Path, folder: Path, in_nanoseconds: bool = False) -> tuple[FloatArray, list[Path]]:
     """Stamps in seconds and files of a table of both, good rows in the order of time.
 
     Args:
         table: words separated by white space or commas, ``#`` before comments.
         folder: that its files are in.
-        wanted: what a row should hold, for the message.
         in_nanoseconds: whatever the number of digits.
     """
-    try:
-        lines = read_text(table).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SequenceError(f"{table} cannot be read ({error}): it needs rows of {wanted}") from error
+    wanted = "'nanoseconds,file'" if in_nanoseconds else "'stamp file'"
     bad = BadRows(table, SequenceError)
     rows: list[tuple[int, float, Path]] = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text_of(table, SequenceError, f"rows of {wanted}").splitlines(), start=1):
         words = line.replace(",", " ").split()
         if not words or line.startswith("#"):
             continue
@@ -112,8 +108,7 @@ def _index(table: Path, folder: Path, wanted: str, in_nanoseconds: bool = False)
         else:
             bad.add(number, f"{line!r} is not {wanted}")
     stamps = np.array([stamp for _, stamp, _ in rows])
-    order = bad.in_order(stamps, "stamps", np.array([number for number, _, _ in rows], np.intp))
-    bad.say(len(order), f"rows of {wanted}")
+    order = bad.in_order(stamps, "stamps", np.array([number for number, _, _ in rows], np.intp), f"rows of {wanted}")
     return stamps[order], [rows[k][2] for k in order]
 
 
@@ -147,7 +142,7 @@ def _open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
     """The left camera, else the right one; rows of ``data.csv`` without an image are gaps in time."""
     camera = _euroc_camera(body)
     assert camera is not None
-    stamps, listed = _index(camera / "data.csv", camera / "data", "'nanoseconds,file'", in_nanoseconds=True)
+    stamps, listed = _index(camera / "data.csv", camera / "data", in_nanoseconds=True)
     files, sensor = by_table(listed, camera / "data.csv"), camera / "sensor.yaml"
     stamps = stamps[files.first :][: len(files)]
     truth = _euroc_truth(body, stamps, sensor)
@@ -204,7 +199,7 @@ _FREIBURG_CAMERAS = {
 
 def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
     """Rows without an image are gaps in time; without a ``camera.yaml`` the folder's name tells a published camera."""
-    stamps, listed = _index(folder / _TUM_INDEX, folder, "'stamp file'")
+    stamps, listed = _index(folder / _TUM_INDEX, folder)
     files = by_table(listed, folder / _TUM_INDEX)
     stamps = stamps[files.first :][: len(files)]
     places, match = (folder, folder.parent), _FREIBURG.search(folder.name)
@@ -213,7 +208,7 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
         own = lambda _: _FREIBURG_CAMERAS[match["camera"]]  # noqa: E731
     depth_maps = None
     if (folder / _TUM_DEPTH).exists():
-        known, paths = _index(folder / _TUM_DEPTH, folder, "'stamp file'")
+        known, paths = _index(folder / _TUM_DEPTH, folder)
         depth_maps = DepthMaps({k: paths[row] for k, row in _near(stamps, known, _NEAR_DEPTH_S)}, _TUM_PER_METRE)
     truth = _truth(folder / "groundtruth.txt", stamps)
     return _recorded("tum", folder.name, files, stamps, asked, places, own, T_any_camera=truth, depth_maps=depth_maps)
@@ -251,9 +246,9 @@ def _fov_camera(path: Path, fps: float, images: ImageFiles) -> CameraFile:
         raise SequenceError(
             f"{path} needs a row of fx fy cx cy and the lens's angle and a row of width and height: {error}"
         ) from error
-    keys = {"fx": fx * width, "fy": fy * height, "cx": cx * width - 0.5, "cy": cy * height - 0.5}
     lens = {"model": "fov", "distortion": [angle]} if angle else {}
-    return camera_of({"width": width, "height": height, "fps": fps, **keys, **lens}, str(path))
+    pinhole = fx * width, fy * height, cx * width - 0.5, cy * height - 0.5
+    return camera_of(pinhole_keys(width, height, *pinhole, fps=fps, **lens), str(path))
 
 
 # 7-Scenes: seq-01/frame-000000.{color.png,depth.png,pose.txt}
@@ -318,11 +313,8 @@ def _scannet_camera(path: Path, images: ImageFiles) -> CameraFile:
         K = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold the 4 x 4 numbers of a camera: {error}") from error
-    return camera_of(_keys(K, images.width, images.height, _FPS), str(path))
-
-
-def _keys(K: FloatArray, width: int, height: int, fps: float) -> dict[str, Any]:
-    return {"width": width, "height": height, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "fps": fps}
+    pinhole = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    return camera_of(pinhole_keys(images.width, images.height, *pinhole, fps=_FPS), str(path))
 
 
 # nuScenes: the tables v1.0-*/scene.json and others, with microseconds
@@ -340,8 +332,10 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         mount = mounts[front[0]["calibrated_sensor_token"]]
         (T_ego_camera,) = _nuscenes_poses([mount])
         T_any_camera = _nuscenes_poses([ego_poses[row["ego_pose_token"]] for row in shown]) @ T_ego_camera
-        keys = _keys(np.array(mount["camera_intrinsic"]), front[0]["width"], front[0]["height"], _NUSCENES_FPS)
-        keys["camera_height_m"] = float(T_ego_camera[2, 3])
+        (fx, _, cx), (_, fy, cy), _ = mount["camera_intrinsic"]
+        height_m = float(T_ego_camera[2, 3])
+        size = front[0]["width"], front[0]["height"]
+        keys = pinhole_keys(*size, fx, fy, cx, cy, fps=_NUSCENES_FPS, camera_height_m=height_m)
         scans: dict[int, ScanReader] = {}
         T_camera_lidar = None
         if lidar:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from slam.sequences.excerpt import SourcedSequence
+from slam.sequences.recording import RecordedSequence
 
-Opener = Callable[[], SourcedSequence]
+Opener = Callable[[], RecordedSequence]
 
 
 @dataclass(frozen=True)

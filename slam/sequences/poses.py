@@ -74,24 +74,13 @@ def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, 
         place = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
         gap = np.minimum(np.abs(stamps - known[place]), np.abs(known[place + 1] - stamps))
         T_near[gap > reach_s] = np.nan
-    describe_unknown(T_near, path)
+    are_known = known_poses(T_near)
+    if not are_known.all():
+        longest = max(runs(np.flatnonzero(are_known).tolist()), key=lambda run: run[1] - run[0], default=None)
+        advice = "" if longest is None else f"; frames {longest[0]}:{longest[1] + 1} have one each (--frames)"
+        missing = int(np.argmin(are_known))
+        logger.warning("%s has no pose of image %d: the sequence has no reference%s", path, missing, advice)
     return T_near
-
-
-def describe_unknown(T_any_camera: FloatArray, path: Path) -> None:
-    """Warn of frames without a true pose, and say which have one.
-
-    Args:
-        T_any_camera: ``(N, 4, 4)``, NaN where unknown.
-        path: the file of true poses.
-    """
-    known = known_poses(T_any_camera)
-    if known.all():
-        return
-    longest = max(runs(np.flatnonzero(known).tolist()), key=lambda run: run[1] - run[0], default=None)
-    advice = "" if longest is None else f"; frames {longest[0]}:{longest[1] + 1} have one each (--frames)"
-    missing = int(np.argmin(known))
-    logger.warning("%s has no pose of image %d: the sequence has no reference%s", path, missing, advice)
 
 
 def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:

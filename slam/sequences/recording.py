@@ -9,23 +9,23 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable
-from collections.abc import Sequence as Items
+from copy import copy
 from dataclasses import InitVar, dataclass, field
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
-from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.formats.rows import BadRows, in_seconds, number_or_nan
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, text_of
 from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
 from slam.sequences.gps import FASTEST_M_S
 from slam.sequences.images import DepthMaps, ImageFiles, ImageSource, too_long
 from slam.sequences.poses import known_poses, rebased
-from slam.sequences.undistortion import calibrated
+from slam.sequences.undistortion import UndistortedImages, Undistortion, calibrated
 
 logger = logging.getLogger(__name__)
 
@@ -63,12 +63,6 @@ class Source:
         return f"{self.name}[{start}:{stop}]" if start < stop else None
 
 
-def labels(sources: Items[Source], frames: int) -> tuple[str, ...]:
-    """The leak record's names for so many frames of a sequence."""
-    found = (source.label(frames) for source in sources)
-    return tuple(label for label in found if label is not None)
-
-
 @dataclass(eq=False)
 class RecordedSequence:
     """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``.
@@ -77,7 +71,8 @@ class RecordedSequence:
     and ``depth_maps``, the true depth beside the stored images, are left out. ``usual_height_m`` is the height of a
     camera that does not say its own. ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown;
     ``reference`` follows from them where all are known. ``distance_to_surface`` gives the distance of points ``(M, 3)``
-    of that world to the true surface, where the whole of it is known.
+    of that world to the true surface, where the whole of it is known. Frame 0 is frame ``start`` of the ``recorded``
+    ones, by which images, scans and depth maps are numbered.
     """
 
     name: str
@@ -94,6 +89,8 @@ class RecordedSequence:
     intrinsics: Intrinsics = field(init=False)
     camera_height_m: float | None = field(init=False)
     reference: FloatArray | None = field(default=None, init=False)
+    start: int = field(default=0, init=False)
+    recorded: int = field(init=False)
 
     def __post_init__(self, camera: CameraFile | Intrinsics, usual_height_m: float | None) -> None:
         """Check images, camera and stamps against each other, and rebase the poses.
@@ -115,7 +112,28 @@ class RecordedSequence:
         _require_plausible_rate(self.name, self.stamps)
         if self.T_camera_lidar is not None and not is_se3(self.T_camera_lidar, _RIGID_TOLERANCE):
             raise SequenceError(f"{self.name}: the calibration of its LiDAR is no rotation and translation")
+        self.recorded = len(self.stamps)
         self.take_truth(self.T_any_camera)
+
+    def cut(self, start: int, stop: int) -> Self:
+        """The frames [start, stop) as a sequence of their own; stamps stay, poses begin at the identity.
+
+        Raises:
+            SequenceError: unless 0 <= start < stop <= len(self).
+        """
+        if not 0 <= start < stop <= len(self):
+            raise SequenceError(f"no frames {start}:{stop} in sequence {self.name}: it has {len(self)}")
+        part = copy(self)
+        part.start, part.stamps = self.start + start, self.stamps[start:stop]
+        part.sources = tuple(source.shifted(start) for source in self.sources)
+        part.T_any_camera = None if self.T_any_camera is None else self.T_any_camera[start:stop]
+        part.reference = self.true_poses(start, stop)
+        return part
+
+    @property
+    def undistortion(self) -> Undistortion | None:
+        """What is done with the images as they are read; None where they have no distortion."""
+        return self.images.undistortion if isinstance(self.images, UndistortedImages) else None
 
     def take_truth(self, T_any_camera: FloatArray | None) -> None:
         """Let these be the true poses."""
@@ -126,7 +144,7 @@ class RecordedSequence:
 
     def __len__(self) -> int:
         """Number of frames."""
-        return len(self.images)
+        return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
         """Read one frame.
@@ -135,13 +153,14 @@ class RecordedSequence:
             MissingFrameError: if its number is missing from the files.
             SequenceError: if its image cannot be read.
         """
-        require_frame(self.name, index, len(self))
+        if not 0 <= index < len(self):
+            raise SequenceError(f"no frame {index} in sequence {self.name}: it has frames 0 to {len(self) - 1}")
         with sequence_errors():
-            return Frame(index, float(self.stamps[index]), self.images.read(index))
+            return Frame(index, float(self.stamps[index]), self.images.read(self.start + index))
 
     def has_scan(self, index: int) -> bool:
         """Whether a LiDAR scan was taken with a frame."""
-        return index in self.scans
+        return self.start + index in self.scans
 
     def scan(self, index: int) -> FloatArray:
         """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR.
@@ -149,10 +168,10 @@ class RecordedSequence:
         Raises:
             SequenceError: there is none, or it cannot be read.
         """
-        if index not in self.scans:
+        if not self.has_scan(index):
             raise SequenceError(f"frame {index} of {self.name} has no scan")
         with sequence_errors():
-            return self.scans[index]()
+            return self.scans[self.start + index]()
 
     def true_poses(self, start: int, stop: int) -> FloatArray | None:
         """``T_world_camera`` of the frames [start, stop), their first the world; None unless all are known."""
@@ -163,7 +182,8 @@ class RecordedSequence:
 
     def true_depth_frames(self) -> list[int]:
         """Frames with a depth map beside their image."""
-        return [] if self.depth_maps is None else sorted(k for k in self.depth_maps.paths if 0 <= k < len(self))
+        paths = {} if self.depth_maps is None else self.depth_maps.paths
+        return [k for k in range(len(self)) if self.start + k in paths]
 
     def true_depth(self, index: int) -> FloatArray:
         """The depth map ``(h, w)`` beside an image in metres, 0 where unknown.
@@ -174,11 +194,12 @@ class RecordedSequence:
         if self.depth_maps is None:
             raise SequenceError(f"{self.name} has no depth maps")
         with sequence_errors():
-            return self.depth_maps.read(index)
+            return self.depth_maps.read(self.start + index)
 
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""
-        return labels(self.sources, len(self))
+        labels = (source.label(len(self)) for source in self.sources)
+        return tuple(label for label in labels if label is not None)
 
 
 @dataclass
@@ -239,14 +260,28 @@ def _doubt_speed(name: str, reference: FloatArray, stamps: FloatArray) -> None:
         )
 
 
-def require_frame(name: str, index: int, frames: int) -> None:
-    """Refuse a frame number outside a sequence.
+def frame_range(text: str, frames: int) -> tuple[int, int]:
+    """Read ``A:B`` as Python reads a slice of so many frames: half-open, either end optional or negative.
+
+    Unlike in Python, an end beyond the sequence is an error.
 
     Raises:
-        SequenceError: if ``index`` is not in [0, frames).
+        SequenceError: if the text is no range, or the range is empty or reaches outside the sequence.
     """
-    if not 0 <= index < frames:
-        raise SequenceError(f"no frame {index} in sequence {name}: it has frames 0 to {frames - 1}")
+    try:
+        begin, end = text.split(":")
+        start, stop = int(begin) if begin.strip() else 0, int(end) if end.strip() else frames
+    except ValueError:
+        raise SequenceError(f"--frames {text!r} is not a range: write A:B, such as 0:300 or 100:") from None
+    first = start + frames if start < 0 else start
+    last = stop + frames if stop < 0 else stop
+    if not (0 <= first < frames and 0 <= last <= frames):
+        raise SequenceError(
+            f"--frames {text} reaches outside the sequence: it has {frames} frames; choose within 0:{frames}"
+        )
+    if first >= last:
+        raise SequenceError(f"--frames {text} holds no frames: A must come before B in A:B")
+    return first, last
 
 
 def uniform_stamps(frames: int, fps: float) -> FloatArray:
@@ -260,10 +295,8 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
     Raises:
         SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
     """
-    try:
-        lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
+    text = text_of(path, SequenceError, "one time in seconds a row")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line.strip())] for line in lines]
     has_header = files.rows_of(len(rows)) is None and files.rows_of(len(rows) - 1) is not None
     rows = rows[has_header:]
@@ -303,8 +336,10 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
 def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     bad, rows = BadRows(path, SequenceError), np.arange(1, len(stamps) + 1)
     rows, times = bad.without(np.isfinite(stamps), "not a time in seconds", rows, stamps)
-    order = bad.in_order(times, "stamps", rows)
-    bad.say(len(order) if len(order) > 1 else 0, "times in seconds that increase, one a row")
+    wanted = "times in seconds that increase, one a row"
+    order = bad.in_order(times, "stamps", rows, wanted)
+    if len(order) == 1:
+        bad.say(0, wanted)
     rows, times = np.sort(rows[order]), times[order]
     period = float(np.median(np.diff(times) / np.diff(rows)))
     reach = np.array([-len(stamps), len(stamps)])  # at both ends the rate goes on

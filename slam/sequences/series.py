@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,52 +39,48 @@ _NAMED_TO_S = 1.5  # names give whole seconds
 _LONGEST_PAUSE = 3.0  # times the usual distance of two pieces, before another drive begins
 
 
-@dataclass(frozen=True)
-class _Piece:
+class Piece(NamedTuple):
+    """A file or folder of a ``drive``, and its ``place`` in it: a number, or the time in seconds at which it begins."""
+
     name: str
-    drive: tuple[str, str]
-    number: int | None
-    begins_s: float | None
+    drive: tuple[str, str, str]
+    place: float
+    is_time: bool
 
     @classmethod
-    def of(cls, name: str, kind: str) -> _Piece | None:
+    def of(cls, name: str, kind: str) -> Piece | None:
+        """The piece of this name; None where it is named as a whole recording."""
         for pattern in _PIECES.get(kind, ()):
             if match := pattern.fullmatch(name):
                 found = match.groupdict()
-                number = int(found["number"] or 0) if "number" in found else None
-                digits = re.sub(r"\D", "", found.get("date", "") + found.get("clock", ""))
-                try:
-                    time = datetime.strptime(digits, "%Y%m%d%H%M%S") if digits else None
-                except ValueError:
-                    continue
-                return cls(name, (found["head"], found["tail"]), number, time.timestamp() if time else None)
+                drive = kind, found["head"], found["tail"]
+                if "date" not in found:
+                    return cls(name, drive, int(found["number"] or 0), False)
+                with suppress(ValueError):  # no date
+                    time = datetime.strptime(re.sub(r"\D", "", found["date"] + found["clock"]), "%Y%m%d%H%M%S")
+                    return cls(name, drive, time.timestamp(), True)
         return None
 
-    @property
-    def place(self) -> float:
-        return self.number or self.begins_s or 0.0
 
-
-def find_series(kinds: Mapping[str, str]) -> list[list[str]]:
-    """Names of the pieces of each recording that has several, in order.
+def find_series(kinds: Mapping[str, str]) -> list[list[Piece]]:
+    """The pieces of each recording that has several, in order.
 
     Args:
         kinds: of recordings, by the names of their files or folders without suffix.
     """
-    drives: dict[tuple[str, str, str], list[_Piece]] = {}
+    drives: dict[tuple[str, str, str], list[Piece]] = {}
     for name, kind in kinds.items():
-        piece = _Piece.of(name, kind)
-        if piece is not None:
-            drives.setdefault((kind, *piece.drive), []).append(piece)
+        if piece := Piece.of(name, kind):
+            drives.setdefault(piece.drive, []).append(piece)
     found = []
     for pieces in drives.values():
-        pieces.sort(key=lambda piece: piece.place)
         if len(pieces) < 2:
             continue
+        pieces.sort(key=lambda piece: piece.place)
         apart = np.diff([piece.place for piece in pieces])
         cuts = [0, *(np.flatnonzero(apart > _LONGEST_PAUSE * np.median(apart)) + 1).tolist(), len(pieces)]
-        found += [[piece.name for piece in pieces[a:b]] for a, b in pairwise(cuts)]
-    return [names for names in found if len(names) > 1]
+        found += [pieces[a:b] for a, b in pairwise(cuts) if b > a + 1]
+    return found
 
 
 class _JoinedImages:
@@ -100,21 +98,24 @@ class _JoinedImages:
         return self._sources[place].read(index - (int(self._ends[place - 1]) if place else 0))
 
 
-def open_series(names: Sequence[str], kind: str, openers: Sequence[Opener]) -> RecordedSequence:
+def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedSequence:
     """Pieces as one recording, at their own stamps where those go on, else one after the other.
 
-    A piece that is missing between two others is a gap, as long as its name says or as the piece before.
+    A piece that is missing between two others is a gap, as long as its name says or as the piece before. Clips much
+    shorter than the regular distance of their names follow each other: their names do not tell when they begin.
 
     Raises:
         SequenceError, DataError: a piece cannot be opened, or is of another camera.
     """
-    parts = [part for part in (opener() for opener in openers) if isinstance(part, RecordedSequence)]
+    parts = [opener() for opener in openers]
     first = parts[0]
     other = next((part for part in parts if part.intrinsics != first.intrinsics), None)
-    if other is not None or len(parts) < len(names):
-        odd = names[-1] if other is None else other.name
-        raise SequenceError(f"{odd} is of another camera than {first.name}: give one of the files as --dataset")
-    logger.info("%s are taken as one recording; give one of the files as --dataset for that alone", ", ".join(names))
+    if other is not None:
+        raise SequenceError(f"{other.name} is of another camera than {first.name}: give one of the files as --dataset")
+    logger.info(
+        "%s are taken as one recording; give one of the files as --dataset for that alone",
+        ", ".join(piece.name for piece in pieces),
+    )
     ends = np.cumsum([len(part) for part in parts])
     starts = [0, *ends[:-1].tolist()]
     poses = [np.full((len(part), 4, 4), np.nan) if part.T_any_camera is None else part.T_any_camera for part in parts]
@@ -122,10 +123,10 @@ def open_series(names: Sequence[str], kind: str, openers: Sequence[Opener]) -> R
     for start, part in zip(starts, parts):
         scans |= {start + k: read for k, read in part.scans.items()}
     return RecordedSequence(
-        name=names[0],
+        name=pieces[0].name,
         images=_JoinedImages([part.images for part in parts], ends),
         camera=first.intrinsics,
-        stamps=_stamps(kind, names, [part.stamps for part in parts]),
+        stamps=_stamps(pieces, [part.stamps for part in parts]),
         sources=tuple(
             replace(source, first=(source.first or 0) - start, length=(source.first or 0) + len(part))
             for start, part in zip(starts, parts)
@@ -138,23 +139,34 @@ def open_series(names: Sequence[str], kind: str, openers: Sequence[Opener]) -> R
     )
 
 
-def _stamps(kind: str, names: Sequence[str], stamps: Sequence[FloatArray]) -> FloatArray:
-    pieces = [_Piece.of(name, kind) for name in names]
+def _stamps(pieces: Sequence[Piece], stamps: Sequence[FloatArray]) -> FloatArray:
     period = float(np.median(np.concatenate([np.diff(each) for each in stamps])))
+    tick_s = _tick_s(pieces, max(float(np.ptp(each)) for each in stamps))
     joined = [stamps[0]]
     for before, piece, each in zip(pieces, pieces[1:], stamps[1:]):
-        last, length_s = joined[-1][-1], joined[-1][-1] - joined[-1][0] + period
-        goes_on = last < each[0] < last + _LONGEST_PAUSE * length_s
-        start = each[0] if goes_on else last + period
-        if not goes_on and kind == "ROS bag":
-            raise SequenceError(f"{piece and piece.name} does not go on where the bag before it ends: give one alone")
-        if not goes_on and before is not None and piece is not None:
-            if before.number is not None and piece.number is not None:
-                start += (piece.number - before.number - 1) * length_s
-            if before.begins_s is not None and piece.begins_s is not None:
-                named = joined[-1][0] + piece.begins_s - before.begins_s
-                start = named if named > start + _NAMED_TO_S else start
+        last, length_s, apart = joined[-1][-1], np.ptp(joined[-1]) + period, piece.place - before.place
+        start = last + period
+        if last < each[0] < last + _LONGEST_PAUSE * length_s:
+            start = each[0]
+        elif piece.drive[0] == "ROS bag":
+            raise SequenceError(f"{piece.name} does not go on where the bag before it ends: give one alone")
+        elif piece.is_time and tick_s is None:
+            named = joined[-1][0] + apart
+            start = named if named > start + _NAMED_TO_S else start
+        else:
+            start += (round(apart / (tick_s or 1)) - 1) * length_s
         if start > last + _LONGEST_PAUSE * period:
-            logger.warning("nothing was recorded for %.1f s before %s", start - last, piece and piece.name)
+            logger.warning("nothing was recorded for %.1f s before %s", start - last, piece.name)
         joined.append(each - each[0] + start)
     return np.concatenate(joined)
+
+
+def _tick_s(pieces: Sequence[Piece], longest_s: float) -> float | None:
+    """The regular distance of names that are times, where it is much longer than the pieces; else None."""
+    apart = np.diff([piece.place for piece in pieces])
+    tick_s = float(apart.min())
+    is_regular = (apart < tick_s + _NAMED_TO_S).sum() > 1
+    if not (pieces[0].is_time and is_regular and tick_s > _LONGEST_PAUSE * longest_s):
+        return None
+    logger.warning("clips of %.1f s are named %.0f s apart: taken as following each other", longest_s, tick_s)
+    return tick_s

@@ -44,7 +44,7 @@ class SimulatedSequence(RecordedSequence):
 
     def true_depth(self, index: int) -> FloatArray:
         """True z-depth ``(H, W)`` of a frame in metres, 0 where unknown."""
-        return np.asarray(self.street.depth(index), dtype=np.float64)
+        return np.asarray(self.street.depth(self.start + index), dtype=np.float64)
 
 
 class _Renderings:

@@ -26,7 +26,6 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline
-from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
@@ -44,11 +43,11 @@ class Rendered(SimulatedSequence):
 
     def frame(self, index: int) -> Frame:
         """A rendered frame."""
-        return Frame(index, float(self.stamps[index]), self._rendered(index).image)
+        return Frame(index, float(self.stamps[index]), self._rendered(self.start + index).image)
 
     def depth(self, index: int) -> FloatArray:
         """True z-depth, the sky at 200 m."""
-        depth = self._rendered(index).depth.astype(np.float64)
+        depth = self._rendered(self.start + index).depth.astype(np.float64)
         return np.where(depth > 0, depth, 200.0)
 
 
@@ -57,12 +56,9 @@ def street() -> Rendered:
     return Rendered(SimulationOptions("loop", frames=250, seed=1000, width=416, height=128))
 
 
-def drive(sequence: Rendered | Excerpt, seed: int, *overrides: str) -> Estimate:
-    base, start = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
-    assert isinstance(base, Rendered) and sequence.reference is not None
-    oracle = OraclePredictor(
-        sequence.reference, lambda k: base.depth(start + k), OracleNoise(**NOISE, seed=seed), FACTOR
-    )
+def drive(sequence: Rendered, seed: int, *overrides: str) -> Estimate:
+    assert sequence.reference is not None
+    oracle = OraclePredictor(sequence.reference, sequence.depth, OracleNoise(**NOISE, seed=seed), FACTOR)
     return SlamPipeline(sequence, oracle, load_config(None, overrides)).run()
 
 
@@ -108,8 +104,8 @@ def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> N
 
 
 def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> None:
-    part = Excerpt(street, 40, 70)
-    oracle = OraclePredictor(part.reference, lambda k: street.depth(40 + k))
+    part = street.cut(40, 70)
+    oracle = OraclePredictor(part.reference, part.depth)
     exact = ["visual_odometry.enabled=false", "depth.refine=none"]  # true depth is the better one
     result = SlamPipeline(part, oracle, load_config(None, exact)).run()
     assert result.map is not None
@@ -119,7 +115,7 @@ def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> Non
 
 @pytest.mark.slow
 def test_the_graph_alone_reduces_the_error(street: Rendered) -> None:
-    part = Excerpt(street, 0, 100)
+    part = street.cut(0, 100)
     options = ("visual_odometry.enabled=false", "mapping.enabled=false")
     runs = [drive(part, seed, *options) for seed in range(4)]
     before, after = (np.mean([ate(getattr(run, name), run) for run in runs]) for name in ("network", "optimised"))

@@ -32,7 +32,6 @@ from slam.runtime.imports import import_extra
 from slam.runtime.run_files import LOG
 from slam.runtime.storage.files import from_anywhere
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import recording_of, undistortion_of
 from slam.sequences.gps import read_gps
 
 logger = logging.getLogger(__name__)
@@ -78,8 +77,8 @@ def perform(request: RunRequest) -> RunFolder:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
         recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
-        lens, camera, (base, start) = undistortion_of(recording), recording.intrinsics, recording_of(recording)
-        numbers = FrameNumbers(len(recording), start, len(base))  # by which files of depth are found
+        lens, camera = recording.undistortion, recording.intrinsics
+        numbers = FrameNumbers(len(recording), recording.start, recording.recorded)  # by which files of depth are found
         undistort = None if lens is None else lens.apply_to_depth
         prediction = open_prediction(request.weights, request.device, settings.depth, camera, numbers, undistort)
         track = None if request.gps is None else read_gps(request.gps)

@@ -16,7 +16,6 @@ from slam.runtime.attempt import Failed
 from slam.runtime.errors import RunError
 
 NOT_RECORDED = "not recorded"
-_MAX_BYTES = 64 * 2**20
 
 Count = Annotated[int, Field(ge=0)]
 
@@ -99,7 +98,7 @@ class Record(BaseModel):
             RunError: damaged, too large, nested without end, or a value of another kind; one line.
         """
         try:
-            content = json.loads(read_text(path, most=_MAX_BYTES), parse_constant=_refused)
+            content = json.loads(read_text(path), parse_constant=_refused)
             json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
             return cls.model_validate(content)
         except FileNotFoundError:

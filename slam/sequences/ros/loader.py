@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import re
 from collections.abc import Iterator
@@ -26,19 +25,9 @@ from slam.sequences.camera_file import find_camera_file
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near, poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source
+from slam.sequences.ros import messages as ros
 from slam.sequences.ros.bag import Bag, is_bag
-from slam.sequences.ros.messages import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    POINT_CLOUD,
-    camera_file_of,
-    image_of,
-    is_rectified,
-    points_of,
-    shows_pictures,
-    values_of,
-)
+from slam.sequences.ros.messages import is_rectified
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +40,6 @@ _POSES = (
 _POSITIONS = ("sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped")
 _TRUTH = re.compile(r"truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack|qualisys|natnet", re.IGNORECASE)
 _STATIC_TOPIC, _MOVING_TOPIC = "/tf_static", "/tf"
-_CACHED_FRAMES = 32
 _MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
 _SKIPPED_FRAMES = 30
@@ -119,6 +107,10 @@ class StampedMessages:
                 return self._bag.parse(self.topic, data)
         raise SequenceError(f"{self._bag.path} breaks off at message {number} of {self.topic}: copy it again")
 
+    def points(self, index: int, where: str) -> FloatArray:
+        """The points ``(P, 3)`` of a cloud, metres; ``where`` names it in errors."""
+        return ros.points_of(self.read(index), where)
+
 
 class BagImages:
     """The images of a topic, all of the size of the first readable ones. Not for use from several threads."""
@@ -132,8 +124,7 @@ class BagImages:
         self.messages = StampedMessages(bag, topic)
         self._where = f"an image of {topic} in {bag.path}"
         self._stretch = self._common_stretch()
-        self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
-        self.height, self.width = first_usual(range(len(self))[:_SOUGHT_IMAGES], self._cached)[1].shape[:2]
+        self.height, self.width = first_usual(range(len(self))[:_SOUGHT_IMAGES], self._decode)[1].shape[:2]
 
     def __len__(self) -> int:
         """Number of images."""
@@ -145,21 +136,21 @@ class BagImages:
         Raises:
             SequenceError, DataError: it cannot be read, or has another size than the first ones.
         """
-        image = self._cached(index)
+        image = self._decode(index)
         if image.shape[:2] != (self.height, self.width):
             height, width = image.shape[:2]
             raise SequenceError(f"{self._where} is {width}x{height}, the first are {self.width}x{self.height}")
-        return image.copy()
+        return image
 
     def _decode(self, index: int) -> Image:
-        return image_of(self.messages.read(index), self._where, self._stretch)
+        return ros.image_of(self.messages.read(index), self._where, self._stretch)
 
     def _common_stretch(self) -> Stretch | None:
         """By some images; None where they have eight bits."""
         seen: list[NDArray[np.uint16]] = []
         for index in range(0, len(self), max(len(self) // _STRETCHED_BY, 1)):
             with suppress(SequenceError, DataError):
-                seen.append(values_of(self.messages.read(index), self._where))
+                seen.append(ros.values_of(self.messages.read(index), self._where))
                 if seen[-1].dtype != np.uint16:
                     return None
         return Stretch.of(seen) if seen else None
@@ -169,16 +160,8 @@ class StaticTransforms:
     """The tree of the frames of ``/tf_static``."""
 
     def __init__(self, bag: Bag) -> None:
-        """Read all static transforms, without bad ones; the last of a frame counts."""
-        self._parents: dict[str, tuple[str, FloatArray]] = {}
-        for message in bag.messages(_STATIC_TOPIC) if _STATIC_TOPIC in bag.types else ():
-            for each in message.transforms:
-                try:
-                    mount = frame_name(each.header.frame_id), transform_of(each.transform)
-                except ValueError as error:
-                    logger.warning("%s: the transform of %r is left out: %s", _STATIC_TOPIC, each.child_frame_id, error)
-                    continue
-                self._parents[frame_name(each.child_frame_id)] = mount
+        """Read all static transforms; the last of a frame counts."""
+        self._parents = {child: (parent, T) for parent, child, _, T in transforms(bag, _STATIC_TOPIC)}
 
     def between(self, a: str, b: str) -> FloatArray | None:
         """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
@@ -201,17 +184,26 @@ class StaticTransforms:
 def moving_frames(bag: Bag) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
     """Stamps ``(M,)`` and ``T_parent_child`` ``(M, 4, 4)`` of the frames of ``/tf``, by parent and child."""
     found: dict[tuple[str, str], dict[float, FloatArray]] = {}
-    for message in bag.messages(_MOVING_TOPIC) if _MOVING_TOPIC in bag.types else ():
+    for parent, child, stamp, T_parent_child in transforms(bag, _MOVING_TOPIC):
+        found.setdefault((parent, child), {}).setdefault(stamp, T_parent_child)
+    return {
+        frames: (np.array(sorted(poses)), np.stack([poses[stamp] for stamp in sorted(poses)]))
+        for frames, poses in found.items()
+    }
+
+
+def transforms(bag: Bag, topic: str) -> Iterator[tuple[str, str, float, FloatArray]]:
+    """Parent, child, stamp in seconds and ``T_parent_child`` ``(4, 4)`` of the good transforms of a topic of tf."""
+    for message in bag.messages(topic) if topic in bag.types else ():
         for each in message.transforms:
-            stamp = each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec
-            with suppress(ValueError):
-                frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
-                found.setdefault(frames, {}).setdefault(stamp, transform_of(each.transform))
-    moving = {}
-    for frames, poses in found.items():
-        stamps = sorted(poses)
-        moving[frames] = np.array(stamps), np.stack([poses[stamp] for stamp in stamps])
-    return moving
+            stamp = each.header.stamp
+            try:
+                T_parent_child = transform_of(each.transform)
+            except ValueError as error:
+                logger.warning("%s: the transform of %r is left out: %s", topic, each.child_frame_id, error)
+                continue
+            frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+            yield *frames, stamp.sec + 1e-9 * stamp.nanosec, T_parent_child
 
 
 def frame_name(text: str) -> str:
@@ -264,14 +256,18 @@ def camera_topics(path: Path) -> list[str]:
         SequenceError: the bag is damaged.
     """
     with closing(Bag(path)) as bag:
-        topics = [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if shows_pictures(bag.first(topic), topic)]
+        topics = [
+            topic
+            for topic in bag.topics(ros.IMAGE, ros.COMPRESSED_IMAGE)
+            if ros.shows_pictures(bag.first(topic), topic)
+        ]
     rectified = {_home(topic) for topic in topics if is_rectified(topic)}
     return [topic for topic in topics if is_rectified(topic) or _home(topic) not in rectified]
 
 
 def _calibration(bag: Bag, topic: str, fps: float, size: tuple[int, int]) -> CameraFile:
     """By the ``camera_info`` beside the images."""
-    known = bag.topics(CAMERA_INFO)
+    known = bag.topics(ros.CAMERA_INFO)
     base, home = topic.removesuffix("/compressed"), _home(topic)
     info = next((name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None)
     if info is None:
@@ -279,7 +275,7 @@ def _calibration(bag: Bag, topic: str, fps: float, size: tuple[int, int]) -> Cam
             f"no {home}/camera_info for {topic} in {bag.path}: it has {', '.join(known) or 'no camera_info'}; give "
             f"--camera"
         )
-    return camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
+    return ros.camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
 
 
 def _home(topic: str) -> str:
@@ -336,7 +332,7 @@ def _scans(
 
     A frame has the cloud nearest to it, if within 50 ms and not nearer to another frame.
     """
-    for topic in bag.topics(POINT_CLOUD):
+    for topic in bag.topics(ros.POINT_CLOUD):
         T_camera_lidar = mounted.between(camera, bag.first(topic).header.frame_id)
         if T_camera_lidar is None:
             logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
@@ -344,12 +340,8 @@ def _scans(
         clouds = StampedMessages(bag, topic)
         pairs = zip(*nearest_pairs(stamps, clouds.stamps, _SCAN_DELAY_S))
         where = f"a cloud of {topic} in {bag.path}"
-        return T_camera_lidar, {int(frame): partial(_points, clouds, int(cloud), where) for frame, cloud in pairs}
+        return T_camera_lidar, {int(frame): partial(clouds.points, int(cloud), where) for frame, cloud in pairs}
     return None, {}
-
-
-def _points(clouds: StampedMessages, index: int, where: str) -> FloatArray:
-    return points_of(clouds.read(index), where)
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:

@@ -14,7 +14,7 @@ from erfsfm.common.readers.images import Stretch, decode_image, decode_values
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.foreign_camera import lens_model
+from slam.sequences.foreign_camera import lens_model, pinhole_keys
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -117,9 +117,9 @@ def camera_file_of(
         fx, fy = fx / binning_x, fy / binning_y
         cx = (cx - roi.x_offset + 0.5) / binning_x - 0.5
         cy = (cy - roi.y_offset + 0.5) / binning_y - 0.5
-    keys = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
     coefficients = [] if model == "pinhole" else [float(value) for value in distortion]
-    return camera_of({**keys, "model": model, "distortion": coefficients}, where)
+    keys = pinhole_keys(width, height, fx, fy, cx, cy, fps=fps, model=model, distortion=coefficients)
+    return camera_of(keys, where)
 
 
 def is_rectified(topic: str) -> bool:

@@ -27,7 +27,6 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.runtime.attempt import Failed
 from slam.runtime.errors import SlamError
-from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
@@ -288,12 +287,12 @@ def test_images_without_corners_leave_only_network_factors() -> None:
 
 
 @pytest.fixture(scope="module")
-def street() -> Excerpt:
-    return Excerpt(SimulatedSequence(SimulationOptions("straight", 40, 1002, 208, 64)), 4, 29)
+def street() -> SimulatedSequence:
+    return SimulatedSequence(SimulationOptions("straight", 40, 1002, 208, 64)).cut(4, 29)
 
 
 def drive_street(
-    street: Excerpt,
+    street: SimulatedSequence,
     progress: Progress = silent,
     mode: str = "auto",
     sky: float = 200.0,
@@ -301,7 +300,7 @@ def drive_street(
 ) -> Estimate:
     oracle = OraclePredictor(
         street.reference,
-        lambda k: np.where((depth := street.base.street.depth(street.start + k)) > 0, depth, sky),
+        lambda k: np.where((depth := street.true_depth(k)) > 0, depth, sky),
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
@@ -310,14 +309,14 @@ def drive_street(
 
 
 @pytest.fixture(scope="module")
-def driven(street: Excerpt) -> tuple[Estimate, list[tuple[str, int, int]]]:
+def driven(street: SimulatedSequence) -> tuple[Estimate, list[tuple[str, int, int]]]:
     """A run, and what it told of its progress."""
     calls: list[tuple[str, int, int]] = []
     return drive_street(street, lambda *words: calls.append(words)), calls
 
 
 def test_two_runs_write_the_same_bytes(
-    street: Excerpt, driven: tuple[Estimate, list[tuple[str, int, int]]], tmp_path: Path
+    street: SimulatedSequence, driven: tuple[Estimate, list[tuple[str, int, int]]], tmp_path: Path
 ) -> None:
     """Corner detection, RANSAC and the threads of GTSAM and Open3D must not change the result."""
     for name, result in (("first", driven[0]), ("second", drive_street(street))):
@@ -346,7 +345,7 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
 
 
-def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt) -> None:
+def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: SimulatedSequence) -> None:
     """In camera heights, which are no metres; depth of the sky is unknown."""
     result = drive_street(street, mode="none", sky=np.nan)
     depths = [street.base.street.depth(street.start + k) for k in range(0, 25, 6)]
@@ -356,7 +355,7 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt)
     assert result.map.statistics()["triangles"] > 5000
 
 
-def test_depth_is_thinned_for_the_map(street: Excerpt, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depth_is_thinned_for_the_map(street: SimulatedSequence, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drive, "MAP_WIDTH_PX", 104)
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
     settings = load_config(None, ["visual_odometry.enabled=false"])

@@ -5,7 +5,6 @@ import numpy as np
 from slam.frames import Intrinsics
 from slam.mapping.filters import KeyframeDepth
 from slam.results.depth import DepthQuality, projected, true_depth
-from slam.sequences.excerpt import Excerpt
 from slam.sequences.images import DepthMaps
 from slam.sequences.recording import RecordedSequence, Source
 
@@ -45,7 +44,7 @@ def test_stored_depth_is_read_and_compared(tmp_path) -> None:
 
 
 def test_an_excerpt_reads_the_frame_of_its_base(tmp_path) -> None:
-    excerpt = Excerpt(with_depth(tmp_path), 2, 4)
+    excerpt = with_depth(tmp_path).cut(2, 4)
     np.testing.assert_allclose(true_depth(excerpt, 0), DEPTH)
     assert true_depth(excerpt, 1) is None
 

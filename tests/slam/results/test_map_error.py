@@ -17,7 +17,6 @@ from slam.geometry.se3 import FloatArray, apply
 from slam.results.map_error import find_truth, map_errors
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import Excerpt
 from slam.sequences.recording import RecordedSequence
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
@@ -103,7 +102,7 @@ def test_scans_that_cannot_be_read_measure_nothing(on_disk: Path, true_map: Floa
 
 
 def test_an_excerpt_has_the_truth_of_its_own_frames(embedded: SimulatedSequence, on_disk: Path) -> None:
-    for sequence in (Excerpt(embedded, 10, 20), open_sequence(on_disk, frames="10:20")):
+    for sequence in (embedded.cut(10, 20), open_sequence(on_disk, frames="10:20")):
         camera = sequence.intrinsics
         depth = embedded.true_depth(15)
         seen = (camera.rays(camera.pixel_grid()) * depth[..., None])[(depth > 0) & (depth < 15)]

@@ -83,15 +83,6 @@ def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: st
     assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx(np.diff(microseconds) / 1e6, abs=1e-6)
 
 
-def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path, ["0.png", "1.png", "2.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml)
-    (tmp_path / "1.png").write_bytes(b"no image")
-    with pytest.raises(SequenceError, match=r"1\.png cannot be decoded") as caught:
-        open_sequence(tmp_path).frame(1)
-    assert not isinstance(caught.value, MissingFrameError)
-
-
 @pytest.mark.parametrize(
     ("name", "rows"),
     [

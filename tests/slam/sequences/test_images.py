@@ -7,7 +7,7 @@ import pytest
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import list_images
 from erfsfm.common.readers.numbering import by_name
-from slam.runtime.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.images import ImageFiles
 
 
@@ -19,15 +19,6 @@ def test_another_size_names_both(tmp_path: Path, images) -> None:
     assert files.read(1)[0, 0, 0] == 10
     with pytest.raises(SequenceError, match=r"2\.png is 41x24, but 0\.png is 40x24"):
         files.read(2)
-
-
-def test_a_missing_number_is_a_missing_frame(tmp_path: Path, images) -> None:
-    images(tmp_path, ["f_07.png", "f_08.png", "f_09.png", "f_11.png"])
-    files = ImageFiles(by_name(list_images(tmp_path)))
-    assert len(files) == 5
-    assert [files.read(index)[0, 0, 0] for index in (0, 1, 2, 4)] == [0, 10, 20, 30]
-    with pytest.raises(MissingFrameError, match=r"no image f_10\.png in .*: the numbering has a gap there"):
-        files.read(3)
 
 
 def test_the_first_readable_image_gives_the_size(tmp_path: Path, images) -> None:

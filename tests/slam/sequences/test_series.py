@@ -51,6 +51,14 @@ def test_files_named_by_their_time(trip: Path) -> None:
     np.testing.assert_allclose(np.diff(sequence.stamps)[[19, 39, 59]], [0.1, 0.1, 2.1], atol=1e-6)
 
 
+def test_clips_named_by_the_minute_that_are_shorter(trip: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for k, minute in enumerate((0, 1, 2, 4)):
+        write_clip(trip / f"20240101_12{minute:02d}00_F.avi", 20 * k)
+    gaps = np.diff(open_sequence(trip).stamps)
+    np.testing.assert_allclose(gaps[[19, 39, 59]], [0.1, 0.1, 2.1], atol=1e-6)
+    assert "named 60 s apart: taken as following each other" in caplog.text
+
+
 def test_numbered_folders(trip: Path, images) -> None:
     for name in ("000", "001"):
         images(trip / name, [f"{k}.png" for k in range(5)])

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
@@ -30,6 +29,6 @@ def test_frames_are_those_of_the_street(sequence: SimulatedSequence) -> None:
 
 
 def test_excerpt_keeps_the_world(sequence: SimulatedSequence) -> None:
-    excerpt = Excerpt(sequence, 4, 10)
+    excerpt = sequence.cut(4, 10)
     assert excerpt.provenance() == ("simulated/1001",)
     assert np.array_equal(excerpt.frame(0).image, sequence.frame(4).image)

@@ -20,7 +20,6 @@ from slam.prediction.depth_folder import DepthFolder, FrameNumbers
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import undistortion_of
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
@@ -124,7 +123,7 @@ def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_pat
     lens: dict[str, Any] = {"width": 416, "height": 128, "fx": 240, "fy": 240, "cx": 207, "cy": 60, "fps": 10}
     camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
     recording = open_sequence(world, "sim", camera)
-    pinhole, lens = recording.intrinsics, undistortion_of(recording)
+    pinhole, lens = recording.intrinsics, recording.undistortion
     assert lens is not None
     K, coefficients = np.array([[240, 0, 207], [0, 240, 60], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])
     maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), pinhole.K, (416, 128), cv2.CV_32FC1)

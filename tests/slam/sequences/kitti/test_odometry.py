@@ -63,7 +63,7 @@ def test_scans(tmp_path: Path, odometry) -> None:
     sequence = open_sequence(tmp_path, "00", None, "1:4")
     assert sequence.has_scan(1) and not sequence.has_scan(0)
     assert sequence.scan(1).tolist() == [[7, 8, 9]]
-    with pytest.raises(SequenceError, match="frame 1 of 00 has no scan"):
+    with pytest.raises(SequenceError, match="frame 0 of 00 has no scan"):
         sequence.scan(0)
 
 

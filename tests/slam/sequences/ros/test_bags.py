@@ -234,45 +234,31 @@ def test_an_mcap_of_another_program_is_named_and_converted_as_advised(tmp_path: 
     assert len(open_sequence(converted.close())) == FRAMES
 
 
-def test_true_poses_of_a_tracker_in_tf(new_bag: NewBag, kind: str) -> None:
+@pytest.mark.parametrize("how", ["tf", "topic", "frame", "unnamed"])
+def test_true_poses_are_those_that_are_named_so(
+    new_bag: NewBag, kind: str, how: str, caplog: pytest.LogCaptureFixture
+) -> None:
     bag = new_bag(kind)
     drive(bag)
     bag.mount("rig", "camera", bag.transform((0, 0, 1)))
     for k in range(-1, FRAMES + 1):
-        each = bag.stamped_transform(FIRST_NS + k * STEP_NS, "vicon/world", "rig", bag.transform((k, 5, 0)))
-        bag.write("/tf", FIRST_NS + k * STEP_NS, bag.make("tf2_msgs/msg/TFMessage", transforms=[each]))
-    reference = open_sequence(bag.close()).reference
-    assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
-
-
-@pytest.mark.parametrize("topic", ["/mocap/pose", "/pose"])
-def test_stamped_poses_are_the_truth_where_their_topic_says_so(
-    new_bag: NewBag, kind: str, topic: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    bag = new_bag(kind)
-    drive(bag)
-    for k in range(-1, FRAMES + 1):
-        where = bag.transform((k, 5, 0))
+        stamp, where = FIRST_NS + k * STEP_NS, bag.transform((k, 5, 0))
+        each = bag.stamped_transform(stamp, "vicon/world", "rig" if how == "tf" else "camera", where)
         point = bag.make("geometry_msgs/msg/Point", x=float(k), y=5.0, z=0.0)
         pose = bag.make("geometry_msgs/msg/Pose", position=point, orientation=where.rotation)
-        stamp = FIRST_NS + k * STEP_NS
-        bag.write(topic, stamp, bag.make("geometry_msgs/msg/PoseStamped", header=bag.header(stamp, "w"), pose=pose))
+        pose = bag.make("geometry_msgs/msg/PoseStamped", header=bag.header(stamp, "w"), pose=pose)
+        topic, message = {
+            "tf": ("/tf", bag.make("tf2_msgs/msg/TFMessage", transforms=[each])),
+            "topic": ("/mocap/pose", pose),
+            "frame": ("/pose", each),
+            "unnamed": ("/pose", pose),
+        }[how]
+        bag.write(topic, stamp, message)
     reference = open_sequence(bag.close()).reference
-    if topic == "/pose":
+    if how == "unnamed":
         assert reference is None and "/pose is not named as truth" in caplog.text
     else:
         assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
-
-
-def test_poses_in_a_frame_that_says_truth(new_bag: NewBag, kind: str) -> None:
-    bag = new_bag(kind)
-    drive(bag)
-    for k in range(-1, FRAMES + 1):
-        stamp = FIRST_NS + k * STEP_NS
-        each = bag.stamped_transform(stamp, "vicon/world", "camera", bag.transform((k, 5, 0)))
-        bag.write("/pose", stamp, each)
-    reference = open_sequence(bag.close()).reference
-    assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
 
 
 def test_a_calibration_without_a_size_is_of_the_images(new_bag: NewBag, kind: str) -> None:

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from slam.sequences.excerpt import frame_range
 from slam.sequences.poses import rebased
-from slam.sequences.recording import Source
+from slam.sequences.recording import Source, frame_range
 
 
 @pytest.mark.parametrize(

@@ -68,17 +68,8 @@ def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
     _require_kind("pose", config.pose)
 
     def built(name: str, width: float) -> nn.Module:
-        # a depth network has no sources, no mask branch, and no alignment
-        return build(
-            name,
-            config.fidelity,
-            width,
-            config.sources,
-            config.normalisation,
-            config.masks,
-            config.activation,
-            config.alignment,
-        )
+        rest = config.normalisation, config.activation, config.alignment
+        return build(name, config.fidelity, width, config.sources, *rest)
 
     return built(config.depth, config.depth_width), built(config.pose, config.pose_width)
 

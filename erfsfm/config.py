@@ -36,9 +36,6 @@ class NetworkConfig(Section):
         default="relu", description="leaky: leaky ReLU, for narrow decoders in which all ReLUs may die"
     )
     sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
-    masks: bool = Field(
-        default=False, description="explainability masks from a second head of the pose network; needs loss.mask_weight"
-    )
     alignment: Literal["none", "images"] = Field(
         default="none", description="images: outside training the pose network's rotations are measured in the images"
     )
@@ -133,9 +130,6 @@ class LossConfig(Section):
         default="depth-second-order", description="smoothed quantity and order of its derivative"
     )
     smoothness_weight: float = Field(default=0.2, ge=0, description="weight of the smoothness term")
-    mask_weight: float = Field(
-        default=0.0, ge=0, description="weight of the explainability regularisation; needs network.masks"
-    )
 
 
 class TeacherConfig(Section):
@@ -263,20 +257,12 @@ class ExperimentConfig(Section):
     @property
     def single_images(self) -> bool:
         """Whether labels of depth are all that is learned from, so that a sample needs no other view."""
-        by_images = self.loss.photometric_weight + self.loss.smoothness_weight > 0 or self.network.masks
+        by_images = self.loss.photometric_weight + self.loss.smoothness_weight > 0
         labelled = self.teacher.views != "two" and self.teacher.structure_weight > 0
         return self.training.networks == "depth" and labelled and not by_images
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
-        if self.loss.mask_weight > 0 and not self.network.masks:
-            raise ValueError("loss.mask_weight needs network.masks: true")
-        both_by_images = self.training.networks == "both" and self.loss.photometric_weight > 0
-        if self.network.masks and self.loss.mask_weight == 0 and both_by_images:
-            raise ValueError(
-                "network.masks needs a loss.mask_weight above 0 (Zhou et al. 2017 take 0.2): without it masks of zero "
-                "have the least loss, and nothing else is learned"
-            )
         if self.data.exact > 0 and (self.teacher.views == "two" or self.teacher.structure_weight == 0):
             raise ValueError(
                 "data.exact needs teacher.views: many or network, whose lengths have the unit of exact depth, and a "

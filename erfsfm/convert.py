@@ -45,7 +45,6 @@ class OldNetwork:
     preset: str
     width: float
     sources: int
-    masks: bool
     tensors: dict[str, Tensor]
 
 
@@ -137,7 +136,6 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
         preset=preset,
         width=first.shape[0] / _FIRST_CHANNELS[kind],
         sources=len(head) // 6 if head is not None else 4,
-        masks=any(name.startswith("mask_decoder.") for name in renamed),
         tensors=renamed,
     )
 
@@ -171,8 +169,10 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
         encoder, decoder = _ENCODER.fullmatch(name), _DECODER.fullmatch(name)
         if encoder:
             layers.setdefault((int(encoder["stage"]), int(encoder["place"])), {})[encoder["rest"]] = value
+        elif decoder and kind == "pose":
+            continue  # explainability masks: only training would need them
         elif decoder:
-            renamed[_decoder_name(kind, decoder["block"], int(decoder["level"]), decoder["rest"])] = value
+            renamed[_decoder_name(decoder["block"], int(decoder["level"]), decoder["rest"])] = value
         elif name.startswith("pose_pred."):
             renamed[name.replace("pose_pred.", "pose_head.", 1)] = value
         else:
@@ -189,13 +189,11 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
     return renamed, tuple(sorted(stages))
 
 
-def _decoder_name(kind: NetworkKind, block: str, level: int, rest: str) -> str:
+def _decoder_name(block: str, level: int, rest: str) -> str:
     """Our lists run from the coarsest level to the finest; the old names count from the finest."""
     if block == "predict_disp":
         return f"heads.{4 - level}.{rest.removeprefix('0.')}"
-    if block == "predict_mask":
-        return f"mask_decoder.heads.{4 - level}.{rest}"
-    return f"{block}s.{7 - level}.{rest}" if kind == "depth" else f"mask_decoder.upconvs.{5 - level}.{rest}"
+    return f"{block}s.{7 - level}.{rest}"
 
 
 def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -233,7 +231,7 @@ def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -
     for kind, network in networks.items():
         settings |= {kind: network.preset, f"{kind}_width": network.width}
     if "pose" in networks:
-        settings |= {"sources": networks["pose"].sources, "masks": networks["pose"].masks}
+        settings |= {"sources": networks["pose"].sources}
     try:
         return NetworkConfig.model_validate(settings)
     except ValidationError as error:

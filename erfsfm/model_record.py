@@ -6,10 +6,10 @@ import hashlib
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
@@ -47,6 +47,14 @@ class ModelRecord(Section):
     version: str = ""
     commit: str = ""
     command: str = ""
+
+    @field_validator("network", mode="before")
+    @classmethod
+    def _known_keys(cls, network: Any) -> Any:
+        """Weights of earlier versions have options that there are no more; their tensors tell whether they matter."""
+        if not isinstance(network, dict):
+            return network
+        return {key: value for key, value in network.items() if key in NetworkConfig.model_fields}
 
 
 def read_record(path: Path) -> ModelRecord:

@@ -1,9 +1,8 @@
-"""Regularisation: smoothness of depth, and a prior on explainability masks."""
+"""Regularisation: smoothness of depth."""
 
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -39,8 +38,3 @@ def edge_aware_smoothness(values: Tensor, image: Tensor) -> Tensor:
     weight_x = torch.exp(-_dx(image).abs().mean(dim=1, keepdim=True))
     weight_y = torch.exp(-_dy(image).abs().mean(dim=1, keepdim=True))
     return (_dx(normalised).abs() * weight_x).mean() + (_dy(normalised).abs() * weight_y).mean()
-
-
-def explainability_prior(masks: Tensor) -> Tensor:
-    """Cross-entropy of explainability masks ``(B, N, H, W)`` against one (Zhou et al. 2017, Eq. 4)."""
-    return F.binary_cross_entropy(masks, torch.ones_like(masks))

@@ -67,7 +67,6 @@ def build(
     width: float = 1.0,
     sources: int = 4,
     normalisation: Normalisation = "none",
-    mask_branch: bool = False,
     activation: Activation = "relu",
     alignment: Alignment = "none",
 ) -> Network:
@@ -80,7 +79,6 @@ def build(
         sources: number of source images of a pose network; a depth network ignores it.
         normalisation: batch norm after every convolution but the heads, or none as published; a pretrained
             encoder has its own, and what follows it has none.
-        mask_branch: explainability masks in a pose network; a depth network ignores it.
         activation: after every convolution but the heads, as published or leaking a tenth.
         alignment: of a pose network's rotations to the images; a depth network ignores it.
 
@@ -102,10 +100,7 @@ def build(
     elif preset.kind == "depth":
         network = DepthNet(preset.variant, fidelity, width, normalisation)
     else:
-        try:
-            network = PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch, alignment)
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
+        network = PoseNet(preset.variant, fidelity, width, sources, normalisation, alignment)
     if activation == "leaky":
         let_leak(network)
     return network

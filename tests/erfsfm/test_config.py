@@ -34,7 +34,7 @@ def test_defaults_are_the_papers() -> None:
     assert config.network.sources == 4
     assert (config.network.height, config.network.width) == (128, 416)
     assert config.loss.smoothness_weight == 0.2
-    assert config.loss.ssim_weight == config.loss.mask_weight == 0
+    assert config.loss.ssim_weight == 0
     assert config.training.learning_rate == 2e-4
     assert load_experiment(None).network.normalisation == "none"
 

@@ -33,11 +33,11 @@ def test_a_file_has_the_experiment_of_its_name(path: Path) -> None:
     presets = networks if "depthnet" in networks else f"depthnet-{networks}"
     presets = presets if "posenet" in presets else f"{presets}-posenet"
     assert f"{network.depth}-{network.pose}" == presets
-    assert (network.fidelity, network.sources, network.normalisation, network.masks) == ("paper", 4, "none", False)
+    assert (network.fidelity, network.sources, network.normalisation) == ("paper", 4, "none")
     assert (network.depth_width, network.pose_width) == (1.0, 1.0)
     loss, training, data = experiment.loss, experiment.training, experiment.data
     assert (loss.smoothness, loss.smoothness_weight) == ("depth-second-order", 0.2)
-    assert (loss.ssim_weight, loss.reduction, loss.auto_mask, loss.mask_weight) == (0, "mean", False, 0)
+    assert (loss.ssim_weight, loss.reduction, loss.auto_mask) == (0, "mean", False)
     assert (training.batch, training.learning_rate, training.schedule, training.steps) == (4, 2e-4, "constant", 200_000)
     assert (data.flip, data.zoom, data.colour_jitter) == (0.5, 1.15, 0)
     assert {"kitti_odometry/09", "kitti_odometry/10"} == set(data.exclude)

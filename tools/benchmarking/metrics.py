@@ -153,11 +153,6 @@ def average(definition: MetricDefinition) -> Cell:
     return lambda group: mean(values(group, definition), definition.decimals)
 
 
-def average_among(definition: MetricDefinition, among: Sequence[JobResult]) -> Cell:
-    """Mean over the results of a group that are also in another one."""
-    return lambda group: mean(values([o for o in group if o in among], definition), definition.decimals)
-
-
 def middle_and_extreme(definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]) -> Cell:
     """Median and the largest or smallest value of a group."""
     return lambda group: spread(values(group, definition), definition.decimals, extreme)

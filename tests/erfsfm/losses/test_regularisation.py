@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from erfsfm.losses.regularisation import edge_aware_smoothness, explainability_prior, second_order_smoothness
+from erfsfm.losses.regularisation import edge_aware_smoothness, second_order_smoothness
 
 
 def ramp(height: int, width: int) -> torch.Tensor:
@@ -37,15 +37,3 @@ def test_edge_aware_by_hand() -> None:
     edge = flat.clone()
     edge[..., 1:] = 1
     assert float(edge_aware_smoothness(values, edge)) == pytest.approx((0.5 + 0.5 * math.exp(-1)) / 2, abs=1e-6)
-
-
-def test_explainability_prior_by_hand() -> None:
-    assert float(explainability_prior(torch.ones(1, 2, 3, 4))) == 0
-    assert float(explainability_prior(torch.full((1, 2, 3, 4), 0.25))) == pytest.approx(math.log(4))
-
-
-def test_gradients() -> None:
-    values = (torch.rand(1, 1, 4, 5, dtype=torch.float64) + 1).requires_grad_()
-    image = torch.rand(1, 3, 4, 5, dtype=torch.float64)
-    assert torch.autograd.gradcheck(second_order_smoothness, (values,))
-    assert torch.autograd.gradcheck(lambda v: edge_aware_smoothness(v, image), (values,))

@@ -25,19 +25,17 @@ def test_depth_parameters(name, fidelity, wanted):
 
 @pytest.mark.parametrize("fidelity", ["default", "paper"])
 @pytest.mark.parametrize(
-    "name, four, four_masked, two, two_masked",
+    "name, four, two",
     [
-        ("posenet", 1_598_456, 3_352_504, 1_590_668, 3_340_388),
-        ("erf-posenet-dilated", 1_598_456, 3_352_504, 1_590_668, 3_340_388),
-        ("erf-posenet-dfc", 1_776_479, 3_530_527, 1_768_691, 3_518_411),
-        ("erf-posenet-dfcv2", 1_759_865, 3_513_913, 1_708_859, 3_458_579),
+        ("posenet", 1_598_456, 1_590_668),
+        ("erf-posenet-dilated", 1_598_456, 1_590_668),
+        ("erf-posenet-dfc", 1_776_479, 1_768_691),
+        ("erf-posenet-dfcv2", 1_759_865, 1_708_859),
     ],
 )
-def test_pose_parameters(name, fidelity, four, four_masked, two, two_masked):
+def test_pose_parameters(name, fidelity, four, two):
     assert count(name, fidelity=fidelity) == four
-    assert count(name, fidelity=fidelity, mask_branch=True) == four_masked
     assert count(name, fidelity=fidelity, sources=2) == two
-    assert count(name, fidelity=fidelity, sources=2, mask_branch=True) == two_masked
 
 
 def test_fidelity_decides_where_offsets_start():

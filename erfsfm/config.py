@@ -92,9 +92,6 @@ class DataConfig(Section):
     validation_snippets: int = Field(default=60, ge=1, description="number of snippets in each validation")
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
     zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
-    roll: float = Field(
-        default=0.0, ge=0, le=30, description="largest roll of the camera in labelled single images, degrees"
-    )
     colour_jitter: float = Field(
         default=0.0, ge=0, le=0.5, description="largest relative change of brightness, contrast, gamma"
     )
@@ -223,7 +220,6 @@ class TrainingConfig(Section):
     gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
     validate_every: int = Field(default=1000, ge=1, description="steps between validations")
     checkpoint_every: int = Field(default=500, ge=1, description="steps between checkpoints")
-    log_every: int = Field(default=50, ge=1, description="steps between log entries")
     precision: Precision = Field(
         default="32-true",
         description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, and 32-true if it has no bfloat16, "

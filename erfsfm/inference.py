@@ -295,13 +295,3 @@ def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
             np.save(file, depth)
 
     write_atomically(path, write)
-
-
-def is_prediction(depth_file: Path) -> bool:
-    """Whether a ``.npy`` file and the ``.png`` beside it look predicted: one a depth map of the other's size."""
-    try:
-        depth = np.load(depth_file, mmap_mode="r", allow_pickle=False)
-        size = read_image(depth_file.with_suffix(".png")).shape[:2]
-        return bool(depth.dtype == np.float32 and depth.shape == size)
-    except (OSError, ValueError, EOFError, AttributeError, DataError):
-        return False

@@ -1,4 +1,4 @@
-"""The YAML loader of both packages: no code, no aliases, no duplicate keys, errors in one line."""
+"""The YAML loader of both packages: no code, no duplicate keys, errors in one line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def read_yaml(path: Path) -> Any:
     """The content of a YAML file; None where it is empty.
 
     Raises:
-        YamlError: missing, too large, not YAML, an alias or a duplicate key; one line.
+        YamlError: missing, too large, not YAML, or a duplicate key; one line.
     """
     if not path.is_file():
         raise YamlError(f"{path} is not there, or not a file")
@@ -47,26 +47,23 @@ def parse_yaml(text: str) -> Any:
     except yaml.YAMLError as error:
         problem, mark = getattr(error, "problem", None) or str(error), getattr(error, "problem_mark", None)
         raise YamlError(f"{problem} (line {mark.line + 1})" if mark else problem) from error
-    except (ValueError, OverflowError, RecursionError) as error:  # a date or number that does not exist, endless lists
+    except (
+        ValueError,
+        TypeError,
+        RecursionError,
+    ) as error:  # a date that does not exist, a list for a key, endless lists
         raise YamlError(str(error)) from error
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML where ``1e-4`` is a number, and aliases and duplicate keys are refused."""
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """As the parent class, without aliases."""
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.MarkedYAMLError(problem="an alias: write it out", problem_mark=self.peek_event().start_mark)
-        return super().compose_node(parent, index)
+    """Safe YAML where ``1e-4`` is a number, and duplicate keys are refused."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """As the parent class, refusing duplicate keys."""
-        keys: set[tuple[str, str]] = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if (key.tag, key.value) in keys:
-                raise yaml.MarkedYAMLError(problem=f"duplicate key '{key.value}'", problem_mark=key.start_mark)
-            keys.add((key.tag, key.value))
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.MarkedYAMLError(problem=f"duplicate key '{key}'", problem_mark=node.start_mark)
         return super().construct_mapping(node, deep)
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.labels.many_views import MIN_SNR, SKY_INVERSE_DEPTH, sky_mask
-from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.flow import Array, Grey, MeasuredDepth
 from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import measure
+from erfsfm.mvs.views import Appearance
 
 SIGMAS = 1.645  # of the bounds: nine of ten errors lie between them
 LEAST_KNOWN = 500  # pixels

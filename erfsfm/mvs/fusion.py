@@ -13,10 +13,10 @@ from onnxruntime import InferenceSession
 
 from erfsfm.common.errors import CheckpointError
 from erfsfm.common.files import read_bytes
-from erfsfm.common.onnx_session import open_session
-from erfsfm.mvs.appearance import Array
+from erfsfm.common.threads import open_session
 from erfsfm.mvs.refine import SIGMA_FLOOR, Measurement, RefinedDepth
 from erfsfm.mvs.sweep import CHANGES, UNIT, Costs, lowest
+from erfsfm.mvs.views import Array
 
 FILE = "fusion.onnx"
 SHIPPED = Path(__file__).parents[1] / "weights" / "fusion"

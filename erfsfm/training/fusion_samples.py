@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import TrainingError
+from erfsfm.data.augmentation import weathered
 from erfsfm.data.exact_depth import FARTHEST_M
 from erfsfm.data.recordings import Recording
-from erfsfm.data.weather import weathered
 from erfsfm.inference import DepthPosePredictor, depth_at
-from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.fusion import evidence
 from erfsfm.mvs.refine import measure
-from erfsfm.mvs.views import BASELINES, neighbours
+from erfsfm.mvs.views import BASELINES, Appearance, Array, neighbours
 
 WIDTH = 416
 CROP = (64, 144)  # of the evidence

@@ -15,8 +15,7 @@ from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
 from erfsfm.geometry.warp import Projection, project_into_source, sample
 from erfsfm.labels.structure import HEIGHTS
-from erfsfm.losses.photometric import photometric_error
-from erfsfm.losses.regularisation import edge_aware_smoothness, second_order_smoothness
+from erfsfm.losses.photometric import edge_aware_smoothness, photometric_error, second_order_smoothness
 from erfsfm.losses.structure import (
     Bounds,
     disagreement,

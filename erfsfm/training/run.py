@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import KINDS, load_model, take_over
-from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.errors import ConfigError
 from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
@@ -38,15 +38,15 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
-from erfsfm.training.keeper import Average, WeightKeeper
+from erfsfm.training.keeper import Average, StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
-from erfsfm.training.progress import StepProgress
 from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
 
+_LOG_STEPS = 25
 _LEFT_OUT = ("method", "leak")  # the same in all rows
 
 
@@ -231,9 +231,6 @@ def _fit(
             warnings.filterwarnings("ignore", message=".*dirpath has changed.*")
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint if resume else None, weights_only=True)
-    except DataError as error:
-        # an error of a worker process has its traceback before the message, its last line
-        raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.common.errors.DataError: ")) from error
     except SystemExit as error:
         number = error.number if isinstance(error, Terminated) else signal.SIGINT  # Lightning turns ctrl-C into an exit
         next_time = "continue with --resume" if checkpoint.is_file() else "start again, for it has no checkpoint yet"
@@ -315,7 +312,7 @@ def _trainer(
         check_val_every_n_epoch=None,
         val_check_interval=training.validate_every if callbacks[0].validates else None,
         num_sanity_val_steps=0,
-        log_every_n_steps=training.log_every,
+        log_every_n_steps=_LOG_STEPS,
         logger=logs,
         callbacks=[latest, *callbacks, *average],
         plugins=[AtomicCheckpoints()],

@@ -13,7 +13,6 @@ from erfsfm.common.yaml_file import MAX_BYTES, YamlError, parse_yaml, read_yaml
     "text",
     [
         "[" * 30_000,
-        "a: &a [*a]",
         "a: 1\nb: 2\n'a': 3",
         "? [a]\n: 1",
         "x: 2011-99-99",

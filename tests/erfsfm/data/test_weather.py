@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.data.weather import weathered
+from erfsfm.data.augmentation import weathered
 
 
 @pytest.fixture

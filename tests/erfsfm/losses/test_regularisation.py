@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from erfsfm.losses.regularisation import edge_aware_smoothness, second_order_smoothness
+from erfsfm.losses.photometric import edge_aware_smoothness, second_order_smoothness
 
 
 def ramp(height: int, width: int) -> torch.Tensor:

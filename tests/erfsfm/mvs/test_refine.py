@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import RefinedDepth, measure
+from erfsfm.mvs.views import Appearance
 
 H, W = 96, 240
 K = np.array([[150.0, 0.0, 119.5], [0.0, 150.0, 47.5], [0.0, 0.0, 1.0]])

@@ -48,7 +48,7 @@ def calls_of(network: nn.Module) -> list[object]:
 )
 @torch.inference_mode()
 def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 2**40)  # all in plain PyTorch
+    monkeypatch.setattr(deformable, "_LARGE", 2**40)  # all in plain PyTorch
     kind = "depth" if "depth" in name else "pose"
     network = with_moving_taps(build(name, width=0.125, sources=4))
     given = [inputs(kind, seed) for seed in range(3)]
@@ -63,7 +63,7 @@ def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, m
 
 @torch.inference_mode()
 def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 1)
+    monkeypatch.setattr(deformable, "_LARGE", 1)
     network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
     graph, calls = OnnxGraph(lambda: network, 1), calls_of(network)
     graph(*inputs("depth", 0))

@@ -1,7 +1,7 @@
 """Single frames of KITTI raw drives: the images around one, its LiDAR depth, and how far the car moved.
 
 Layout: ``ROOT/2011_09_26/2011_09_26_drive_0013_sync/{image_02,velodyne_points,oxts}/data``, calibration in the folder
-of the date (`erfsfm.common.readers.kitti_drives`). Images may be smaller than the original; the calibration follows.
+of the date (`erfsfm.common.readers.kitti`). Images may be smaller than the original; the calibration follows.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.kitti_calibration import (
+from erfsfm.common.readers.kitti import (
     ASPECT_TOLERANCE,
     CAM_TO_CAM,
     CAMERA_HEIGHT_M,
     VELO_TO_CAM,
     CalibrationFile,
     FloatArray,
+    velocity,
 )
-from erfsfm.common.readers.kitti_sensors import velocity
 from erfsfm.config import Fidelity
 
 _FRAME = re.compile(

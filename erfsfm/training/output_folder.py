@@ -36,8 +36,6 @@ class OutputFolder:
             raise TrainingError(f"{self.path} holds a run already: continue with --resume or choose another --output")
         names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name} - {MEASUREMENTS}
         foreign = sorted(names - _BEGUN)
-        if not foreign and names and not self._has_our_config():
-            foreign = [CONFIG if CONFIG in names else min(names)]
         if foreign:
             raise TrainingError(
                 f"{self.path} holds files that 'erfsfm train' did not write ({foreign[0]}): choose a new or empty "
@@ -73,13 +71,6 @@ class OutputFolder:
     def write_config(self, config: ExperimentConfig) -> None:
         """Write the complete configuration of the run."""
         write_atomically(self.path / CONFIG, lambda path: path.write_text(dump_yaml(config)))
-
-    def _has_our_config(self) -> bool:
-        """Whether ``config.yaml`` is what `write_config` writes: all keys, in its order."""
-        try:
-            return dump_yaml(load_experiment(self.path / CONFIG)) == (self.path / CONFIG).read_text()
-        except ConfigError:
-            return False
 
 
 def _steps_of(checkpoint: Path) -> int:

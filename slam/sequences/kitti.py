@@ -19,25 +19,27 @@ from scipy.spatial.transform import Rotation
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import has_images, list_images
-from erfsfm.common.readers.kitti_calibration import (
+from erfsfm.common.readers.kitti import (
     CAM_TO_CAM,
     CAMERA_HEIGHT_M,
     IMU_TO_VELO,
     ODOMETRY_CALIBRATION,
-    VELO_TO_CAM,
-    CalibrationFile,
-)
-from erfsfm.common.readers.kitti_drives import (
     ODOMETRY_CAMERAS,
     ODOMETRY_DRIVES,
     RAW_CAMERAS,
+    VELO_TO_CAM,
+    VELOCITY_EAST,
+    VELOCITY_NORTH,
+    VELOCITY_UP,
+    CalibrationFile,
     OdometryRoot,
     drive_name,
     find_drives,
     find_odometry_root,
     odometry_camera,
+    read_packet,
+    read_velodyne,
 )
-from erfsfm.common.readers.kitti_sensors import VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP, read_packet, read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
 from erfsfm.common.readers.pinhole import Pinhole
 from slam.formats.ply import read_ply

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from erfsfm.common.readers.kitti_calibration import CalibrationFile
+from erfsfm.common.readers.kitti import CalibrationFile
 from slam.geometry import se3
 from slam.geometry.se3 import invert
 

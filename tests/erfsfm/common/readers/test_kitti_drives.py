@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.kitti_drives import drive_name, find_drives, find_odometry_root, odometry_camera
+from erfsfm.common.readers.kitti import drive_name, find_drives, find_odometry_root, odometry_camera
 
 
 @pytest.mark.parametrize("given", ["root[1]", "root[1]/dataset", "root[1]/dataset/sequences"])

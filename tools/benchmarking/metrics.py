@@ -9,7 +9,7 @@ from statistics import fmean, median, stdev
 from typing import Any
 
 from benchmarking.plan import slug
-from benchmarking.work import JobResult, ratio
+from benchmarking.work import JobResult, loops, ratio
 
 from erfsfm.common.table import DASH, Table
 
@@ -52,17 +52,18 @@ _R_REL, _SCALE = (
 )
 R_REL = MetricDefinition("r_rel_deg_per_100m", "r_rel (deg / 100 m)", _R_REL, 2)
 SCALE = MetricDefinition("scale", "scale", _SCALE, 3)
-PERCENT = MetricDefinition("ate_7dof_optimised_percent", "7-dof, % of path", lambda o: o.derived.optimised_percent, 2)
-PERCENT_6 = MetricDefinition(
-    "ate_6dof_optimised_percent", "6-dof, % of path", lambda o: ratio(ATE_6.value(o), LENGTH.value(o), 100.0), 2
+PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK = (
+    MetricDefinition(key, title, lambda o, part=part, whole=whole, unit=unit: ratio(part(o), whole(o), unit), 2)
+    for key, title, part, whole, unit in (
+        ("ate_7dof_optimised_percent", "7-dof, % of path", ATE_7.value, LENGTH.value, 100.0),
+        ("ate_6dof_optimised_percent", "6-dof, % of path", ATE_6.value, LENGTH.value, 100.0),
+        ("ate_7dof_network_percent", "network, % of path", ERRORS[0].value, LENGTH.value, 100.0),
+        ("ate_7dof_of_network", "of network's", ATE_7.value, ERRORS[0].value, 1.0),
+    )
 )
-NETWORK_PERCENT = MetricDefinition(
-    "ate_7dof_network_percent", "network, % of path", lambda o: o.derived.network_percent, 2
-)
-OF_NETWORK = MetricDefinition("ate_7dof_of_network", "of network's", lambda o: o.derived.of_network, 2)
 LOOPS = MetricDefinition("loops_accepted", "loops closed", lambda o: o.metrics.loops.accepted, 0)
-TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: o.derived.true_loops, 0)
-FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: o.derived.false_loops, 0)
+TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: loops(o.job.place / "run")[0], 0)
+FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: loops(o.job.place / "run")[1], 0)
 COVERAGE = MetricDefinition("coverage_95", "coverage of 95 %", lambda o: o.metrics.graph.coverage.inside_95, 2)
 TRIANGLES = MetricDefinition("map_triangles", "map triangles", lambda o: o.metrics.map.triangles, 0)
 MAP_ERRORS = (
@@ -83,15 +84,22 @@ MAP_SIZES = (
     MetricDefinition("map_frames_fused", "frames fused", lambda o: o.metrics.map.frames_fused, 0),
     MetricDefinition("map_floater_share", "floaters", lambda o: o.metrics.map.floater_share, 3),
 )
-FUSION = MetricDefinition("fusion_ms_per_keyframe", "fusion (ms / keyframe)", lambda o: o.derived.fusion_ms, 1)
+FUSION = MetricDefinition(
+    "fusion_ms_per_keyframe",
+    "fusion (ms / keyframe)",
+    lambda o: ratio(stage_seconds(o, "map"), o.metrics.map.frames_fused, 1e3),
+    1,
+)
 MESH = MetricDefinition("mesh_seconds", "mesh (s)", lambda o: stage_seconds(o, "mesh"), 1)
 RATE = MetricDefinition("frames_per_second", "frames / s", lambda o: o.metrics.timing.frames_per_second, 1)
 MEMORY = MetricDefinition("peak_rss_mb", "peak RSS (MiB)", lambda o: o.metrics.timing.peak_rss_mb, 0)
 SECONDS = MetricDefinition("seconds_total", "seconds", lambda o: o.metrics.timing.seconds_total, 1)
-COMMAND = MetricDefinition("command_seconds", "whole command (s)", lambda o: o.process.seconds, 1)
-LOAD = MetricDefinition("load_average", "load before", lambda o: o.process.load, 1)
-TIME = MetricDefinition("ms_per_frame", "ms / frame", lambda o: o.process.ms_per_frame, 1)
-CPU = MetricDefinition("cpu_ms_per_frame", "CPU ms / frame", lambda o: o.process.cpu_ms_per_frame, 1)
+COMMAND = MetricDefinition("command_seconds", "whole command (s)", lambda o: o.seconds, 1)
+LOAD = MetricDefinition("load_average", "load before", lambda o: o.load, 1)
+TIME = MetricDefinition("ms_per_frame", "ms / frame", lambda o: ratio(SECONDS.value(o), FRAMES.value(o), 1e3), 1)
+CPU = MetricDefinition(
+    "cpu_ms_per_frame", "CPU ms / frame", lambda o: ratio(o.metrics.timing.cpu_seconds, FRAMES.value(o), 1e3), 1
+)
 DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
 DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, TRIANGLES)
 DEFINITIONS += (*MAP_ERRORS, *MAP_SIZES[1:], FUSION, MESH)

@@ -16,7 +16,6 @@ Fidelity = Literal["default", "paper"]
 TrainedNetworks = Literal["both", "depth", "pose"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 _COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
-_LAST_MAP_ONE_PIXEL = 128  # pixels of an image; seven convolutions halve it
 
 
 class NetworkConfig(Section):
@@ -279,13 +278,6 @@ class ExperimentConfig(Section):
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
         if self.training.minutes > 0 and self.training.devices > 1:
             raise ValueError("training.minutes needs training.devices: 1: the clocks of several would differ")
-        network, plain = self.network, any("lite0" not in name for name in (self.network.depth, self.network.pose))
-        one_pixel = max(network.height, network.width) <= _LAST_MAP_ONE_PIXEL
-        if plain and network.normalisation == "batch" and self.training.batch == 1 and one_pixel:
-            raise ValueError(
-                f"network.normalisation: batch has one value to normalise in a batch of one {network.height}x"
-                f"{network.width} image: training.batch must be 2 or more, or the images larger than 128 pixels"
-            )
         return self
 
 

@@ -31,7 +31,7 @@ from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import opencv_threads
-from erfsfm.config import ExperimentConfig, Precision, TrainingConfig
+from erfsfm.config import ExperimentConfig, Precision
 from erfsfm.data.exact_depth import by_label, stacked
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
@@ -78,7 +78,12 @@ def train(
     Raises:
         ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
     """
-    _require_devices(config.training.devices, device)
+    on_cpu = choose_device(device) == "cpu"
+    there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
+    if config.training.devices > there:
+        raise ConfigError(
+            f"training.devices is {config.training.devices} on a machine with {there}: set {there} or fewer"
+        )
     folder = OutputFolder(output)
     rank = LightningEnvironment().local_rank()
     done_steps = folder.resumable_steps(config) if resume else 0
@@ -88,16 +93,32 @@ def train(
     if config.data.validation and not validation and rank == 0:
         logger.warning("training runs without validation: no recording of data.validation is among the data")
     lightning.seed_everything(config.training.seed, verbose=False)
-    timer = _timer(config.training.minutes)
+    minutes = config.training.minutes
+    timer = Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)  # keeps its time in checkpoints
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(training, config, (done_steps, rank), output, progress)
+    together = config.training.batch * config.training.devices
+    _, measured = by_label(training, config.data)
+    views = measured_views(measured, config, config.teacher.cache or output / MEASUREMENTS, progress)
+    last, done = config.training.steps * together, done_steps * together
+    draws = SnippetDraws(training, config, last, done, rank, views, imitated(config))
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
-    keeper = _keeper(config.training, output, seen, command, bool(validation), device)
+    decay = config.training.average_decay
+    average = Average(decay, choose_device(device)) if decay > 0 else None
+    keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks, average)
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
-    loader = _loader(draws, config, device)
+    workers = config.data.workers
+    loader = DataLoader(
+        draws,
+        config.training.batch,
+        num_workers=workers,
+        pin_memory=not on_cpu,
+        worker_init_fn=_single_threaded_worker,
+        collate_fn=stacked,
+        persistent_workers=workers > 0,
+    )
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     with raising_on_termination(), FolderLock() as lock:
         if rank == 0:
@@ -154,59 +175,6 @@ def depth_before_and_after(
         errors = many_view_errors(networks, validation, cache, True, progress)
         rows += [{"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT} for row in errors]
     return rows
-
-
-def _require_devices(wanted: int, device: str) -> None:
-    on_cpu = choose_device(device) == "cpu"
-    there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
-    if wanted > there:
-        raise ConfigError(
-            f"training.devices is {wanted} on a machine with {there} {'cores' if on_cpu else 'GPUs'}: "
-            f"set training.devices={there} or fewer"
-        )
-
-
-def _timer(minutes: float) -> Timer:
-    """Time of the loop, kept in checkpoints; it ends the run after some minutes, if any are given."""
-    return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
-
-
-def _keeper(
-    training: TrainingConfig, output: Path, seen: list[str], command: str, validates: bool, device: str
-) -> WeightKeeper:
-    decay = training.average_decay
-    average = Average(decay, choose_device(device)) if decay > 0 else None
-    return WeightKeeper(output, seen, command, validates, training.networks, average)
-
-
-def _draws(
-    training: list[Recording],
-    config: ExperimentConfig,
-    position: tuple[int, int],
-    output: Path,
-    progress: Progress,
-) -> SnippetDraws:
-    """What this process trains on; ``position``: steps done and rank."""
-    done_steps, rank = position
-    together = config.training.batch * config.training.devices
-    draws, done = config.training.steps * together, done_steps * together
-    _, measured = by_label(training, config.data)
-    folder = config.teacher.cache or output / MEASUREMENTS
-    many_views = measured_views(measured, config, folder, progress)
-    return SnippetDraws(training, config, draws, done, rank, many_views, imitated(config))
-
-
-def _loader(draws: SnippetDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
-    workers = config.data.workers
-    return DataLoader(
-        draws,
-        config.training.batch,
-        num_workers=workers,
-        pin_memory=choose_device(device) == "cuda",
-        worker_init_fn=_single_threaded_worker,
-        collate_fn=stacked,
-        persistent_workers=workers > 0,
-    )
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:
@@ -280,12 +248,6 @@ def _trainer(
     training = config.training
     on_cpu = choose_device(device) == "cpu"
     precision = _precision_on_cpu(training.precision) if on_cpu else training.precision
-    if on_cpu and precision == "bf16-mixed" and max(config.network.height, config.network.width) <= 64:
-        # PyTorch 2.13 leaves gradients of its bfloat16 convolutions uninitialised where the feature map is one pixel
-        raise ConfigError(
-            f"training.precision {training.precision} on a CPU needs images of more than 64 pixels in one direction; "
-            f"got {config.network.height}x{config.network.width}: set training.precision=32-true"
-        )
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     latest = ModelCheckpoint(
         output / "checkpoints",

@@ -143,7 +143,7 @@ class CalibrationFile:
         """Read a file.
 
         Raises:
-            DataError: it is missing or cannot be read, or two rows of one name differ.
+            DataError: it is missing or cannot be read.
         """
         self.path = path
         if not path.is_file():
@@ -155,9 +155,6 @@ class CalibrationFile:
             raise DataError(f"cannot read calibration {path}: {error}") from error
         rows = [line.partition(":") for line in text.splitlines() if line.strip()]
         self._rows = {key.strip(): value.split() for key, _, value in rows}
-        doubled = [key.strip() for key, _, value in rows if self._rows[key.strip()] != value.split()]
-        if doubled:
-            raise DataError(f"{path} has two rows {doubled[0]} with other numbers: keep the right one")
 
     def __contains__(self, key: str) -> bool:
         """Whether the file has a row of this name."""

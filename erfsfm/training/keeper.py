@@ -18,7 +18,7 @@ from erfsfm.checkpoint import KINDS, Absent, Model, save_model
 from erfsfm.common.errors import TrainingError
 from erfsfm.common.progress import Progress, duration
 from erfsfm.common.readers.frame_range import merge
-from erfsfm.config import TrainedNetworks
+from erfsfm.config import TrainingConfig
 from erfsfm.model_record import ModelRecord, commit, read_record
 from erfsfm.training.module import SelfSupervision, decisive
 
@@ -57,15 +57,15 @@ class WeightKeeper(Callback):
         seen: list[str],
         command: str,
         validates: bool,
-        networks: TrainedNetworks,
-        average: Average | None = None,
+        training: TrainingConfig,
+        device: str = "cpu",
     ) -> None:
         self._output = output
-        self.average = average
+        self.average = Average(training.average_decay, device) if training.average_decay > 0 else None
         self._seen = seen
         self._command = command
         self.validates = validates
-        self._networks = networks
+        self._networks = training.networks
         self._best = dict.fromkeys(self._measures({}), math.inf)
         for folder in self._best:
             if (folder / "model.yaml").is_file():

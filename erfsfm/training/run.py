@@ -38,7 +38,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
-from erfsfm.training.keeper import Average, StepProgress, WeightKeeper
+from erfsfm.training.keeper import StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
@@ -58,9 +58,7 @@ def train(
     command: str = "",
     progress: Progress = silent,
 ) -> Path:
-    """Train, validate, keep the best.
-
-    With several devices Lightning starts the program again for each further one; these exit here.
+    """Train, validate, keep the best; with several devices Lightning starts further processes, which exit here.
 
     Args:
         config: the experiment.
@@ -80,10 +78,8 @@ def train(
     """
     on_cpu = choose_device(device) == "cpu"
     there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
-    if config.training.devices > there:
-        raise ConfigError(
-            f"training.devices is {config.training.devices} on a machine with {there}: set {there} or fewer"
-        )
+    if (devices := config.training.devices) > there:
+        raise ConfigError(f"training.devices is {devices} on a machine with {there}: set {there} or fewer")
     folder = OutputFolder(output)
     rank = LightningEnvironment().local_rank()
     done_steps = folder.resumable_steps(config) if resume else 0
@@ -96,29 +92,14 @@ def train(
     minutes = config.training.minutes
     timer = Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)  # keeps its time in checkpoints
     module = SelfSupervision(config, timer.time_elapsed)
-    together = config.training.batch * config.training.devices
-    _, measured = by_label(training, config.data)
-    views = measured_views(measured, config, config.teacher.cache or output / MEASUREMENTS, progress)
-    last, done = config.training.steps * together, done_steps * together
-    draws = SnippetDraws(training, config, last, done, rank, views, imitated(config))
+    draws = _draws(config, training, (done_steps, rank), output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
-    decay = config.training.average_decay
-    average = Average(decay, choose_device(device)) if decay > 0 else None
-    keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks, average)
+    keeper = WeightKeeper(output, seen, command, bool(validation), config.training, choose_device(device))
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
-    workers = config.data.workers
-    loader = DataLoader(
-        draws,
-        config.training.batch,
-        num_workers=workers,
-        pin_memory=not on_cpu,
-        worker_init_fn=_single_threaded_worker,
-        collate_fn=stacked,
-        persistent_workers=workers > 0,
-    )
+    loader = _loader(draws, config, pin_memory=not on_cpu)
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     with raising_on_termination(), FolderLock() as lock:
         if rank == 0:
@@ -175,6 +156,31 @@ def depth_before_and_after(
         errors = many_view_errors(networks, validation, cache, True, progress)
         rows += [{"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT} for row in errors]
     return rows
+
+
+def _draws(
+    config: ExperimentConfig, training: list[Recording], position: tuple[int, int], output: Path, progress: Progress
+) -> SnippetDraws:
+    """What this process trains on; ``position``: steps done and rank."""
+    done_steps, rank = position
+    together = config.training.batch * config.training.devices
+    _, measured = by_label(training, config.data)
+    views = measured_views(measured, config, config.teacher.cache or output / MEASUREMENTS, progress)
+    last, done = config.training.steps * together, done_steps * together
+    return SnippetDraws(training, config, last, done, rank, views, imitated(config))
+
+
+def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> DataLoader[dict[str, Tensor]]:
+    workers = config.data.workers
+    return DataLoader(
+        draws,
+        config.training.batch,
+        num_workers=workers,
+        pin_memory=pin_memory,
+        worker_init_fn=_single_threaded_worker,
+        collate_fn=stacked,
+        persistent_workers=workers > 0,
+    )
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:

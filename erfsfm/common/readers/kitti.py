@@ -22,6 +22,8 @@ from erfsfm.common.files import read_bytes, read_text
 from erfsfm.common.readers.images import has_images, natural_key
 from erfsfm.common.readers.pinhole import Pinhole, require_plausible
 
+FloatArray = NDArray[np.float64]
+
 ODOMETRY_CAMERAS = (2, 3, 0, 1)  # left and right colour, left and right grey
 RAW_CAMERAS = ("02", "03", "00", "01")
 SIMULATION_FILE = "simulation.json"
@@ -122,8 +124,6 @@ def drive_name(text: str) -> str:
     """The canonical name of a drive that a user writes with or without its date folder and ``_sync``."""
     return Path(text).name.removesuffix("_sync")
 
-
-FloatArray = NDArray[np.float64]
 
 ODOMETRY_CALIBRATION = "calib.txt"
 CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
@@ -253,8 +253,6 @@ def _rigid(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:
     T_a_b[:3, :3], T_a_b[:3, 3] = R_a_b, t_a_b
     return T_a_b
 
-
-FloatArray = NDArray[np.float64]
 
 VELOCITY_NORTH, VELOCITY_EAST, VELOCITY_UP = 6, 7, 10  # columns, m/s
 _COLUMNS = 30

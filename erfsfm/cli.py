@@ -300,7 +300,7 @@ def networks(
     """
     from erfsfm.networks.presets import describe
 
-    summaries = [asdict(summary) for summary in describe(fidelity, width, sources)]
+    summaries = describe(fidelity, width, sources)
     if as_json:
         typer.echo(json.dumps(summaries, indent=2))
         return

@@ -44,10 +44,7 @@ class NetworkConfig(Section):
     @model_validator(mode="after")
     def _can_be_halved(self) -> Self:
         if self.alignment == "images" and (self.height % _COARSEST or self.width % _COARSEST):
-            raise ValueError(
-                f"network.alignment: images needs a height and width that are multiples of {_COARSEST}; got "
-                f"{self.height} and {self.width}"
-            )
+            raise ValueError(f"network.alignment: images needs a height and width that are multiples of {_COARSEST}")
         return self
 
 

@@ -70,9 +70,7 @@ def convert(
         CheckpointError: unreadable, of another kind, or two of one kind; one line.
     """
     if (output / "model.yaml").exists():
-        raise CheckpointError(
-            f"{output} holds weights already: name both checkpoints in one command, or another folder"
-        )
+        raise CheckpointError(f"{output} holds weights already: name both checkpoints in one command")
     networks: dict[NetworkKind, OldNetwork] = {}
     for file in files:
         network = read_old(file, dilated)
@@ -80,9 +78,7 @@ def convert(
             raise CheckpointError(f"{networks[network.kind].path} and {file} both hold a {network.kind} network")
         networks[network.kind] = network
     if dilated and "pose" not in networks:
-        raise CheckpointError(
-            "dilated needs a pose network, and no pose network was given; the reference's dilated DispNetS cannot run"
-        )
+        raise CheckpointError("dilated needs a pose network: the reference's dilated DispNetS cannot run")
     record = ModelRecord(
         network=_config(networks, size),
         networks="both" if len(networks) == 2 else next(iter(networks)),
@@ -148,9 +144,7 @@ def _tensors(path: Path) -> dict[str, Tensor]:
             warnings.filterwarnings("ignore", message="Detected pickle protocol")
             loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        raise CheckpointError(
-            f"{path} is damaged, no checkpoint, or would execute code when read: refused; get it from its authors again"
-        ) from error
+        raise CheckpointError(f"{path} is damaged, no checkpoint, or would execute code: get it again") from error
     except MemoryError:
         raise
     except Exception as error:  # a damaged file makes PyTorch raise anything, failed assertions too
@@ -236,7 +230,5 @@ def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -
         return NetworkConfig.model_validate(settings)
     except ValidationError as error:
         first = error.errors()[0]
-        where, files = ".".join(map(str, first["loc"])), ", ".join(str(network.path) for network in networks.values())
-        raise CheckpointError(
-            f"{files}: no network of ours has {where} {first['input']}: {first['msg'].lower()}"
-        ) from error
+        where = ".".join(map(str, first["loc"]))
+        raise CheckpointError(f"no network of ours has {where} {first['input']}: {first['msg'].lower()}") from error

@@ -225,10 +225,7 @@ class DepthPosePredictor:
     def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
         """The output of a network, refused where it is not finite: float16 weights may overflow in a forward pass."""
         if not np.isfinite(output).all():
-            raise CheckpointError(
-                f"the {kind} network of {self.origin} gives NaN or infinite values: its training diverged; use other "
-                "weights"
-            )
+            raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
         return output
 
     @staticmethod

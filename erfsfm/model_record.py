@@ -84,10 +84,7 @@ def find_weights(name_or_folder: str | Path) -> Path:
     if str(name_or_folder) in shipped:
         return SHIPPED / str(name_or_folder)
     if folder.is_dir():
-        raise CheckpointError(
-            f"{folder} holds no model.yaml: it is not an output folder of 'erfsfm train' (or training has not "
-            "written weights yet)"
-        )
+        raise CheckpointError(f"{folder} holds no model.yaml: it is no output folder of a training")
     raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
 
 

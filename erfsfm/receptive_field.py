@@ -186,7 +186,7 @@ def _row(
     device: str,
 ) -> FieldRow:
     probe = build(name, fidelity, _PROBE_WIDTH).to(device)
-    size = snippet[0].shape[:2]
+    size = (snippet[0].shape[0], snippet[0].shape[1])
     pushed = offsets_px if any(layer.deformable for layer in probe.encoder_layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
     outputs = itertools.product(*map(range, seen.map_size))

@@ -106,9 +106,7 @@ class DriveLabels:
             with np.load(path, allow_pickle=False) as entry:
                 return entry["least"], entry["most"]
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise TrainingError(
-                f"the teacher's label {path} is damaged or missing: delete it and start again ({error})"
-            ) from error
+            raise TrainingError(f"the teacher's label {path} is damaged: delete it, start again ({error})") from error
 
     def measure_poses(self, weights: str) -> None:
         """Run the SLAM system on the drive and keep its poses."""
@@ -297,10 +295,7 @@ class ManyViewTeacher:
         without = [drive for drive in drives if not drive.poses_file.is_file()]
         for drive in drives:
             if drive.compact and (drive in without or (self.measures != "poses" and any(_missing(drive, sources)))):
-                raise TrainingError(
-                    f"{drive.folder} holds not all labels of many views that are wanted: prepare the data again with "
-                    "this teacher and this size of the networks"
-                )
+                raise TrainingError(f"{drive.folder} lacks labels: prepare the data again with this teacher and size")
         for done, drive in enumerate(without):
             progress("teacher: poses", done, len(without))
             drive.measure_poses(weights)

@@ -61,9 +61,7 @@ def read_split_file(name_or_path: str) -> Split:
     except YamlError as error:
         raise DataError(str(error)) from error
     except ValidationError as error:
-        raise DataError(
-            f"{path} is no split, a file of the lists train, validation and test: {first_problem(error)}"
-        ) from error
+        raise DataError(f"{path} is no split of train, validation and test: {first_problem(error)}") from error
 
 
 def _folders() -> list[Path]:

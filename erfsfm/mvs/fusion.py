@@ -54,9 +54,7 @@ class DepthFusion:
             raise CheckpointError(f"{path} is damaged, or no ONNX file: train it again") from error
         inputs = self._session.get_inputs()
         if [i.name for i in inputs] != ["evidence"] or inputs[0].shape[1] != CHANNELS:
-            raise CheckpointError(
-                f"{path} is not a network of erfsfm train-fusion, or of another version: train it again"
-            )
+            raise CheckpointError(f"{path} is no network of this version of erfsfm train-fusion: train it again")
 
     def decide(self, measurement: Measurement) -> RefinedDepth:
         """Between learned and measured depth at each pixel; the network finds by itself what moves."""

@@ -125,15 +125,10 @@ def _check_shapes(
 ) -> tuple[int, int]:
     """Check the shapes and return the size of the output."""
     if input.dim() != 4 or weight.dim() != 4:
-        raise ValueError(
-            f"input and weight must have four dimensions; got {tuple(input.shape)} and {tuple(weight.shape)}"
-        )
+        raise ValueError(f"input and weight must be 4-d; got {tuple(input.shape)} and {tuple(weight.shape)}")
     batch, channels = input.shape[:2]
     if channels % weight.shape[1] or weight.shape[0] % (channels // weight.shape[1]):
-        raise ValueError(
-            f"weight must have shape (C_out, {channels} / groups, k_h, k_w) with groups dividing C_out; "
-            f"got {tuple(weight.shape)}"
-        )
+        raise ValueError(f"weight must have shape (C_out, {channels} / groups, k_h, k_w); got {tuple(weight.shape)}")
     out_h, out_w = (
         (input.shape[2 + i] + 2 * padding[i] - dilation[i] * (weight.shape[2 + i] - 1) - 1) // stride[i] + 1
         for i in range(2)

@@ -114,10 +114,7 @@ class DepthNet(nn.Module):
             ConfigError: for the dilated network in paper fidelity, which fits no image.
         """
         if self.variant == "dilated" and self.fidelity == "paper":
-            raise ConfigError(
-                "erf-depthnet-dilated cannot run in paper fidelity: its maps shrink below what the decoder "
-                "needs at every image size; use fidelity 'default'"
-            )
+            raise ConfigError("erf-depthnet-dilated cannot run in paper fidelity: its maps shrink; use 'default'")
         if image.dim() != 4 or image.shape[1] != 3:
             raise ValueError(f"image must have shape (B, 3, H, W); got {tuple(image.shape)}")
         disparities = self._decode(image, self.encoder(image))

@@ -107,10 +107,7 @@ def _stacked(target: Tensor, sources: Sequence[Tensor], count: int) -> Tensor:
         raise ValueError(f"this pose network takes {count} sources; got {len(sources)}")
     for image in (target, *sources):
         if image.dim() != 4 or image.shape[1] != 3 or image.shape != target.shape:
-            raise ValueError(
-                "target and sources must have one shape (B, 3, H, W); "
-                f"got {tuple(target.shape)} and {tuple(image.shape)}"
-            )
+            raise ValueError(f"images must have one shape (B, 3, H, W): {tuple(target.shape)} and {tuple(image.shape)}")
     return torch.cat([target, *sources], dim=1)
 
 

@@ -75,9 +75,7 @@ def train_fusion(
     assert STEP == 2**LEVELS, "evidence is padded for another network"
     torch.manual_seed(seed)
     if (output / FILE).exists() and not (output / RECORD).exists():
-        raise TrainingError(
-            f"{output / FILE} is not of erfsfm train-fusion and would be replaced: choose another --output"
-        )
+        raise TrainingError(f"{output / FILE} is not of train-fusion and would be replaced: choose another --output")
     output.mkdir(parents=True, exist_ok=True)
     data = _drawn(datasets, weights, samples, seed, progress)
     held_out = _drawn(validation, weights, max(samples // 20, _CHUNK), _VALIDATION_SEED, progress)
@@ -286,9 +284,7 @@ class FusionSamples:
             raise TrainingError(f"no drive has depth maps and poses: {_WANTED}")
         flat = [r for r, _ in posed if _height(r) < 2 * CROP[0]]
         if flat:
-            raise TrainingError(
-                f"{flat[0].name} has images of {flat[0].camera.width} x {flat[0].camera.height}: {_WANTED}"
-            )
+            raise TrainingError(f"{flat[0].name} has flatter images: {_WANTED}")
         self._recordings, self._poses = zip(*posed, strict=True)
         self._networks, self._rng = networks, np.random.default_rng(seed)
 

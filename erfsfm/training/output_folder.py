@@ -52,9 +52,7 @@ class OutputFolder:
         written = self.path / CONFIG
         for needed in (self.checkpoint, written):
             if not needed.is_file():
-                raise TrainingError(
-                    f"nothing to resume in {self.path}: no {needed.relative_to(self.path)}; start without --resume"
-                )
+                raise TrainingError(f"nothing to resume in {self.path}: no {needed.name}; start without --resume")
         steps = _steps_of(self.checkpoint)
         begun = load_experiment(written)
         if begun.network != config.network:
@@ -62,10 +60,7 @@ class OutputFolder:
         for key in ("networks", "frozen_stages"):
             before, now = getattr(begun.training, key), getattr(config.training, key)
             if before != now:
-                raise ConfigError(
-                    f"{written} began with training.{key} {before}; got {now}, which cannot take over the optimiser's "
-                    "state: resume with the same, or start again from its weights"
-                )
+                raise ConfigError(f"{written} began with training.{key} {before}; got {now}: resume with the same")
         return steps
 
     def write_config(self, config: ExperimentConfig) -> None:
@@ -86,6 +81,4 @@ def _steps_of(checkpoint: Path) -> int:
     except MemoryError:
         raise
     except Exception as error:  # a damaged file makes PyTorch raise anything, failed assertions too
-        raise TrainingError(
-            f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start again in another --output"
-        ) from error
+        raise TrainingError(f"{checkpoint} is damaged or no checkpoint: start again in another --output") from error

@@ -123,9 +123,7 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ConfigError(f"--prepare {output} is not empty: choose a new folder; nothing was changed")
     if config.data.validation_share > 0:  # it would be taken off again
-        raise ConfigError(
-            "--prepare keeps whole recordings to validate on: set data.validation, and data.validation_share=0"
-        )
+        raise ConfigError("--prepare keeps whole recordings to validate on: set data.validation_share=0")
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
     _, measured = by_label(training, config.data)
@@ -234,9 +232,7 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
             trained = model.depth_net if kind == "depth" else model.pose_net
             take_over(module.network(kind), trained.state_dict())
     except ConfigError as error:
-        raise ConfigError(
-            f"initial_weights '{name}' are of another network, {model.record.network.model_dump()}: {error}"
-        ) from error
+        raise ConfigError(f"initial_weights '{name}' are of another network: {error}") from error
     if model.record.networks != module.known:
         module.known = "both"
     if (model.record.network.depth, model.record.network.depth_width) == (wanted.depth, wanted.depth_width):

@@ -54,9 +54,7 @@ class CameraFile(BaseModel):
         if not isinstance(height_m, str | None) and not 0 < height_m <= HIGHEST_M:
             raise ValueError(f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}")
         if self.readout_ms > 1e3 / self.fps:
-            raise ValueError(
-                f"readout_ms: a frame is read before the next, within {1e3 / self.fps:g} ms; is {self.readout_ms:g}"
-            )
+            raise ValueError(f"readout_ms: at most {1e3 / self.fps:g}, the time of a frame; is {self.readout_ms:g}")
         problem = impossible(self.pinhole)
         if problem is not None:
             raise ValueError(problem)

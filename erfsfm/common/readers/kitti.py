@@ -175,9 +175,7 @@ class CalibrationFile:
         except ValueError as error:
             raise DataError(f"{self.path} row {key}: {error}; it needs {count} numbers") from error
         if len(numbers) != count or not np.isfinite(numbers).all():
-            raise DataError(
-                f"{self.path} row {key} has {len(numbers)} numbers: it needs {count} finite ones; restore the file"
-            )
+            raise DataError(f"{self.path} row {key} has {len(numbers)} numbers: it needs {count} finite ones")
         return numbers.reshape(shape)
 
     def transform(self, R_key: str, t_key: str) -> FloatArray:
@@ -225,10 +223,7 @@ class CalibrationFile:
             raise DataError(f"{self.path} row S_rect_{camera} must hold a positive width and height; restore the file")
         full_width, full_height = int(size[0]), int(size[1])
         if abs(width * full_height / (height * full_width) - 1) > ASPECT_TOLERANCE:
-            raise DataError(
-                f"the images are {width}x{height}, but camera {camera} in {self.path} is {full_width}x{full_height}: "
-                f"the images were cropped or are of another camera"
-            )
+            raise DataError(f"{self.path} is of another camera, or images were cropped to {width}x{height}")
         full = self._pinhole(f"P_rect_{camera}", full_width, full_height)
         require_plausible(full, f"{self.path} row P_rect_{camera}")
         return full.resized(width, height)

@@ -57,20 +57,20 @@ def test_width_scales_hidden_channels_and_not_the_heads():
 
 def test_descriptions_in_both_fidelities():
     for fidelity in ("default", "paper"):
-        summaries = {summary.name: summary for summary in describe(fidelity)}
+        summaries = {summary["name"]: summary for summary in describe(fidelity)}
         of_paper = [name for name, preset in PRESETS.items() if preset.encoder == "paper"]
         assert list(summaries) == (of_paper if fidelity == "paper" else list(PRESETS))
-        assert summaries["depthnet"].parameters == 31_596_900
-        assert summaries["depthnet"].multiply_adds == pytest.approx(3.67e9, rel=2e-3)
-        assert summaries["posenet"].multiply_adds == pytest.approx(0.256e9, rel=2e-3)
-        assert summaries["posenet"].receptive_field == 263
+        assert summaries["depthnet"]["parameters"] == 31_596_900
+        assert summaries["depthnet"]["multiply_adds"] == pytest.approx(3.67e9, rel=2e-3)
+        assert summaries["posenet"]["multiply_adds"] == pytest.approx(0.256e9, rel=2e-3)
+        assert summaries["posenet"]["receptive_field"] == 263
         dilated = summaries["erf-depthnet-dilated"]
-        assert dilated.receptive_field == 829
+        assert dilated["receptive_field"] == 829
         if fidelity == "paper":
-            assert dilated.multiply_adds is None and "cannot run" in str(dilated.multiply_adds_reason)
-            assert summaries["erf-posenet-dilated"].receptive_field == 301
+            assert dilated["multiply_adds"] is None and "cannot run" in str(dilated["multiply_adds_reason"])
+            assert summaries["erf-posenet-dilated"]["receptive_field"] == 301
         else:
-            assert dilated.multiply_adds == summaries["depthnet"].multiply_adds
-            assert dilated.multiply_adds_reason is None
-            assert summaries["erf-posenet-dilated"].multiply_adds == summaries["posenet"].multiply_adds
-            assert summaries["erf-posenet-dilated"].receptive_field == 339
+            assert dilated["multiply_adds"] == summaries["depthnet"]["multiply_adds"]
+            assert dilated["multiply_adds_reason"] is None
+            assert summaries["erf-posenet-dilated"]["multiply_adds"] == summaries["posenet"]["multiply_adds"]
+            assert summaries["erf-posenet-dilated"]["receptive_field"] == 339

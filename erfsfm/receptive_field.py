@@ -187,7 +187,7 @@ def _row(
 ) -> FieldRow:
     probe = build(name, fidelity, _PROBE_WIDTH).to(device)
     size = (snippet[0].shape[0], snippet[0].shape[1])
-    pushed = offsets_px if any(layer.deformable for layer in probe.encoder_layers()) else 0.0
+    pushed = offsets_px if any(layer.deformable for layer in probe.encoder.layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
     outputs = itertools.product(*map(range, seen.map_size))
     supports = [measured(probe, size, output, pushed).gradient > 0 for output in outputs]

@@ -76,10 +76,6 @@ class PoseNet(nn.Module):
         """Channels of the encoder's input: the target and its sources, stacked."""
         return 3 * (1 + self.sources)
 
-    def encoder_layers(self) -> list[Layer]:
-        """Geometry of the encoder's convolutions, first to last."""
-        return self.encoder.layers()
-
     def forward(self, target: Tensor, sources: Sequence[Tensor]) -> Tensor:
         """Predict the motion from the target camera to each source camera.
 

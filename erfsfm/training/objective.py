@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.geometry.camera import scale_intrinsics
-from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
-from erfsfm.geometry.warp import Projection, project_into_source, sample
+from erfsfm.geometry.transforms import Projection, pose_vector_to_matrix, project_into_source, sample, with_rotation
 from erfsfm.labels.structure import HEIGHTS
 from erfsfm.losses.photometric import edge_aware_smoothness, photometric_error, second_order_smoothness
 from erfsfm.losses.structure import (

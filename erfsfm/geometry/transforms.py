@@ -1,4 +1,4 @@
-"""SE(3) on tensors, and the inverse warp: a source image seen from the target camera (Zhou et al. 2017, Section 3.2)."""
+"""SE(3) on tensors, and the inverse warp: a source image seen from the target camera (Zhou et al. 2017)."""
 
 from __future__ import annotations
 

@@ -101,7 +101,9 @@ def first_problem(error: ValidationError) -> str:
     """The first problem of a validation error as ``key: problem``, for small files that have no overrides."""
     first = error.errors(include_url=False)[0]
     place = ".".join(str(part) for part in first["loc"])
-    return f"{place or 'all of it'}: {first['msg'].removeprefix('Value error, ')}"
+    in_short = {"missing": "missing", "extra_forbidden": "unknown key"}
+    said = in_short.get(first["type"], first["msg"].removeprefix("Value error, "))
+    return f"{place}: {said}" if place else said
 
 
 def _read_tree(path: Path) -> dict[str, Any]:

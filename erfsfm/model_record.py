@@ -13,9 +13,8 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from erfsfm.common.config_tree import Section, first_problem
+from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
 from erfsfm.common.errors import CheckpointError
-from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import NetworkConfig
 
 FORMAT: Literal[1] = 1

@@ -28,8 +28,7 @@ from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
-from erfsfm.labels.many_views import NEIGHBOURS, label
-from erfsfm.labels.refined_depth import in_camera_heights, refined_label, shrunk
+from erfsfm.labels.many_views import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
 from erfsfm.labels.structure import TeacherStructure
 from erfsfm.mvs.flow import Grey, measure
 from erfsfm.mvs.views import neighbours_around

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from erfsfm.common.config_tree import Section, first_problem
+from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
 from erfsfm.common.errors import DataError
-from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import config_folders
 
 _FRAMES = re.compile(r"(?P<recording>.+)\[(?P<runs>[\d:, ]+)\]")

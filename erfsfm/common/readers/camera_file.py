@@ -10,10 +10,9 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from erfsfm.common.config_tree import first_problem
+from erfsfm.common.config_tree import first_problem, read_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.readers.pinhole import Pinhole, impossible, require_plausible
-from erfsfm.common.yaml_file import read_yaml
 
 CAMERA_FILE = "camera.yaml"
 logger = logging.getLogger(__name__)

@@ -26,7 +26,7 @@ class OutputFolder:
         """Accept a folder that is new, empty, or of a run that failed before its first checkpoint.
 
         Raises:
-            TrainingError: a run with weights, or files that no training wrote; one line.
+            TrainingError, ConfigError: a run with weights, or files that no training wrote; one line.
         """
         if not self.path.exists():
             return
@@ -41,6 +41,8 @@ class OutputFolder:
                 f"{self.path} holds files that 'erfsfm train' did not write ({foreign[0]}): choose a new or empty "
                 "--output; nothing was changed"
             )
+        if (self.path / CONFIG).is_file():
+            load_experiment(self.path / CONFIG)  # of another program it would be replaced
 
     def resumable_steps(self, config: ExperimentConfig) -> int:
         """Steps done at the last checkpoint.

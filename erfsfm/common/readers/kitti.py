@@ -206,8 +206,7 @@ class CalibrationFile:
         ):
             raise DataError(
                 f"{self.path}: the principal point ({camera.cx:g}, {camera.cy:g}) in row {key} is far from the middle "
-                f"of {width}x{height} images: calibration and images are of different sizes; scale the calibration as "
-                f"the images were"
+                f"of {width}x{height} images: they are of different sizes; scale the calibration as the images were"
             )
         require_plausible(camera, f"{self.path} row {key}")
         return camera
@@ -234,12 +233,6 @@ class CalibrationFile:
         skew_free = P[0, 1] == P[1, 0] == P[2, 0] == P[2, 1] == 0 and P[2, 2] == 1
         if not (fx > 0 and fy > 0 and skew_free):
             raise DataError(f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file")
-        if not (0 < cx < width and 0 < cy < height):
-            raise DataError(
-                f"{self.path} row {key} has its principal point at ({cx:g}, {cy:g}), outside the "
-                f"{width}x{height} images: calibration and images are of different sizes; scale the calibration as the "
-                f"images were"
-            )
         return Pinhole(width, height, fx, fy, cx, cy)
 
 

@@ -1,4 +1,4 @@
-"""Training of the network that fuses learned depth with the measurements of neighbouring images."""
+"""The network that fuses learned depth with the measurements of neighbouring images, its samples and its training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights that a run writes: the latest, the best, and their records."""
+"""Callbacks of a training: the weights that it writes, the latest and the best, and what it says of its steps."""
 
 from __future__ import annotations
 

@@ -216,6 +216,7 @@ class TrainingConfig(Section):
     gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
     validate_every: int = Field(default=1000, ge=1, description="steps between validations")
     checkpoint_every: int = Field(default=500, ge=1, description="steps between checkpoints")
+    log_every: int = Field(default=50, ge=1, description="steps between log entries")
     precision: Precision = Field(
         default="32-true",
         description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, and 32-true if it has no bfloat16, "

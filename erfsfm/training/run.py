@@ -46,7 +46,6 @@ from erfsfm.training.supervision import imitated, measured_views, seen_by_imitat
 
 logger = logging.getLogger(__name__)
 
-_LOG_STEPS = 25
 _LEFT_OUT = ("method", "leak")  # the same in all rows
 
 
@@ -276,7 +275,7 @@ def _trainer(
         check_val_every_n_epoch=None,
         val_check_interval=training.validate_every if callbacks[0].validates else None,
         num_sanity_val_steps=0,
-        log_every_n_steps=_LOG_STEPS,
+        log_every_n_steps=training.log_every,
         logger=logs,
         callbacks=[latest, *callbacks, *average],
         plugins=[AtomicCheckpoints()],

@@ -46,7 +46,7 @@ def states(model: Model) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize(
-    "network", [{}, {"masks": True}, {"depth": "erf-depthnet-dfcv2", "pose": "erf-posenet-dfc", "fidelity": "paper"}]
+    "network", [{}, {"sources": 2}, {"depth": "erf-depthnet-dfcv2", "pose": "erf-posenet-dfc", "fidelity": "paper"}]
 )
 def test_round_trip(tmp_path: Path, network: dict[str, Any]) -> None:
     model = fresh(**network)

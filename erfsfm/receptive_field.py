@@ -186,10 +186,11 @@ def _row(
     device: str,
 ) -> FieldRow:
     probe = build(name, fidelity, _PROBE_WIDTH).to(device)
-    size = (snippet[0].shape[0], snippet[0].shape[1])
+    height, width = snippet[0].shape[:2]
+    size = (height, width)
     pushed = offsets_px if any(layer.deformable for layer in probe.encoder.layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
-    outputs = itertools.product(*map(range, seen.map_size))
+    outputs = itertools.product(range(seen.map_size[0]), range(seen.map_size[1]))
     supports = [measured(probe, size, output, pushed).gradient > 0 for output in outputs]
     network, weights = _with_weights(name, fidelity, learned)
     return FieldRow(

@@ -38,6 +38,10 @@ def _error(trajectory: str, alignment: str) -> MetricDefinition:
     return MetricDefinition(f"ate_{alignment}dof_{trajectory}_m", title, value, 2)
 
 
+def _share(key: str, title: str, part: MetricDefinition, whole: MetricDefinition, unit: float) -> MetricDefinition:
+    return MetricDefinition(key, title, lambda o: ratio(part.value(o), whole.value(o), unit), 2)
+
+
 def stage_seconds(o: JobResult, stage: str) -> float | None:
     """Seconds of a stage of a run."""
     return (o.metrics.timing.stages or {}).get(stage)
@@ -52,15 +56,10 @@ _R_REL, _SCALE = (
 )
 R_REL = MetricDefinition("r_rel_deg_per_100m", "r_rel (deg / 100 m)", _R_REL, 2)
 SCALE = MetricDefinition("scale", "scale", _SCALE, 3)
-PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK = (
-    MetricDefinition(key, title, lambda o, part=part, whole=whole, unit=unit: ratio(part(o), whole(o), unit), 2)
-    for key, title, part, whole, unit in (
-        ("ate_7dof_optimised_percent", "7-dof, % of path", ATE_7.value, LENGTH.value, 100.0),
-        ("ate_6dof_optimised_percent", "6-dof, % of path", ATE_6.value, LENGTH.value, 100.0),
-        ("ate_7dof_network_percent", "network, % of path", ERRORS[0].value, LENGTH.value, 100.0),
-        ("ate_7dof_of_network", "of network's", ATE_7.value, ERRORS[0].value, 1.0),
-    )
-)
+PERCENT = _share("ate_7dof_optimised_percent", "7-dof, % of path", ATE_7, LENGTH, 100.0)
+PERCENT_6 = _share("ate_6dof_optimised_percent", "6-dof, % of path", ATE_6, LENGTH, 100.0)
+NETWORK_PERCENT = _share("ate_7dof_network_percent", "network, % of path", ERRORS[0], LENGTH, 100.0)
+OF_NETWORK = _share("ate_7dof_of_network", "of network's", ATE_7, ERRORS[0], 1.0)
 LOOPS = MetricDefinition("loops_accepted", "loops closed", lambda o: o.metrics.loops.accepted, 0)
 TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: loops(o.job.place / "run")[0], 0)
 FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: loops(o.job.place / "run")[1], 0)

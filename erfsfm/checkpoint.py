@@ -48,10 +48,7 @@ class Absent(nn.Module):
         Raises:
             CheckpointError: always.
         """
-        raise CheckpointError(
-            f"{self._folder} holds no {self.kind} network: the other one alone was trained or converted; use weights "
-            "that have both"
-        )
+        raise CheckpointError(f"{self._folder} holds no {self.kind} network: use weights that have both")
 
     def state_dict(self, *_args: Any, **_options: Any) -> Any:
         """Refuse, as `forward` does."""
@@ -68,17 +65,8 @@ def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
     _require_kind("pose", config.pose)
 
     def built(name: str, width: float) -> nn.Module:
-        # a depth network has no sources, no mask branch, and no alignment
-        return build(
-            name,
-            config.fidelity,
-            width,
-            config.sources,
-            config.normalisation,
-            config.masks,
-            config.activation,
-            config.alignment,
-        )
+        rest = config.normalisation, config.activation, config.alignment
+        return build(name, config.fidelity, width, config.sources, *rest)
 
     return built(config.depth, config.depth_width), built(config.pose, config.pose_width)
 
@@ -146,24 +134,13 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
         CheckpointError: of another architecture, or not numbers.
     """
     wanted = net.state_dict()
-    missing, extra = wanted.keys() - tensors.keys(), tensors.keys() - wanted.keys()
-    if missing or extra:
-        example = sorted(missing or extra)[0]
-        raise CheckpointError(
-            f"{origin} is of another architecture than {wanted_by}: {len(missing)} tensors missing, {len(extra)} "
-            f"unknown, first '{example}'"
-        )
+    if strange := sorted(wanted.keys() ^ tensors.keys()):
+        raise CheckpointError(f"{origin} is of another architecture than {wanted_by}: first '{strange[0]}'")
     for key, value in tensors.items():
         if value.shape != wanted[key].shape:
-            raise CheckpointError(
-                f"{origin}: '{key}' must have shape {tuple(wanted[key].shape)}; got {tuple(value.shape)}: it is of "
-                f"another width or preset than {wanted_by}"
-            )
+            raise CheckpointError(f"{origin}: '{key}' has another shape than {wanted_by}: {tuple(value.shape)}")
         if value.is_floating_point() and not torch.isfinite(value).all():
-            raise CheckpointError(
-                f"{origin}: '{key}' holds NaN or infinite values: the training diverged or the file is damaged; use "
-                "other weights"
-            )
+            raise CheckpointError(f"{origin}: '{key}' holds NaN or infinite values: use other weights")
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
 
 
@@ -197,9 +174,7 @@ def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:
         source = key if key in trained else _elsewhere(key)
         if source in trained:
             if trained[source].shape != fresh.shape:
-                raise ConfigError(
-                    f"'{source}' has shape {tuple(trained[source].shape)} where {tuple(fresh.shape)} is needed"
-                )
+                raise ConfigError(f"'{source}' has another shape than {tuple(fresh.shape)}")
             filled[key] = trained[source]
             known.discard(source)
         elif key.endswith(".bias") and f"{key.removesuffix('bias')}kernel.weight" in trained:

@@ -4,26 +4,240 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from erfsfm.cli_evaluate import evaluate_app
-from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights
-from erfsfm.cli_train import train, train_fusion
 from erfsfm.common import command_line
-from erfsfm.common.table import Table
+from erfsfm.common.errors import ConfigError, DataError, ErfsfmError
+from erfsfm.common.progress import progress_bar
+from erfsfm.common.table import Table, table_of
 
 logger = logging.getLogger(__name__)
 
 app = command_line.application("erfsfm", "Self-supervised depth and ego-motion networks with wide receptive fields.")
+evaluate_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Depth and pose errors of trained networks."
+)
 app.add_typer(evaluate_app, name="evaluate")
-app.command()(train)
-app.command("train-fusion")(train_fusion)
+
+Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
+UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")]
+Weights = Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output folder")]
+ManyWeights = Annotated[
+    list[str], typer.Option(help="a shipped name (default, sim) or a training output folder; repeat to compare")
+]
+Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
+Fidelity = Annotated[Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")]
+
+
+@app.command()
+def train(
+    config: Annotated[str, typer.Option(help="a YAML file, or the name of a shipped configuration")],
+    dataset: Annotated[
+        list[Path] | None,
+        typer.Option(help="KITTI odometry or raw root, image folder, video or prepared folder; repeat"),
+    ] = None,
+    output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
+    prepare: Annotated[
+        Path | None,
+        typer.Option(
+            help="write the frames, at the networks' size, and the labels to this folder, and stop: it is a "
+            "--dataset for the same training elsewhere"
+        ),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")] = False,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+    seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
+    device: Device = "auto",
+) -> None:
+    """Train a depth and a pose network; OUTPUT is what --weights takes.
+
+    Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
+    """
+    from erfsfm.config import load_experiment
+    from erfsfm.training.run import depth_before_and_after
+    from erfsfm.training.run import prepare as prepare_training
+    from erfsfm.training.run import train as run_training
+
+    changes = list(overrides or [])
+    if seed is not None:
+        changes.append(f"training.seed={seed}")
+    experiment = load_experiment(config, changes).with_roots(dataset or [])
+    with progress_bar() as progress:
+        if prepare is not None:
+            prepare_training(experiment, prepare, progress)
+            typer.echo(f"train with: erfsfm train --config {config} --dataset {prepare}")
+            return
+        folder = run_training(experiment, output, resume, device, _command(), progress)
+        typer.echo(f"weights in {folder}: use them with --weights {folder}")
+        typer.echo(_how_good(folder))
+        if experiment.initial_weights is None or experiment.data.validation_share == 0:
+            return
+        try:
+            rows = depth_before_and_after(experiment, folder, device, progress)
+        except ErfsfmError as error:
+            logger.warning("depth before and after training was not compared: %s", error)
+            return
+    print_rows(rows, as_json=False)
+
+
+def _how_good(folder: Path) -> str:
+    """What the last validation measured, and the command that measures the weights on other data."""
+    from erfsfm.model_record import read_record
+
+    record = read_record(folder / "model.yaml")
+    units = {
+        "abs_rel": "AbsRel {:.3f}",
+        "snippet_ate": "snippet ATE {:.4f} m",
+        "photometric": "photometric error {:.4f}",
+    }
+    measured = [
+        text.format(record.metrics[key])
+        for key, text in units.items()
+        if math.isfinite(record.metrics.get(key, math.nan))
+    ]
+    kind, data = ("pose", "KITTI --sequence 09") if record.networks == "pose" else ("depth", "ROOT")
+    said = f"validation: {', '.join(measured)}" if measured else "they were not validated"
+    return f"{said}; errors on other data: erfsfm evaluate {kind} --weights {folder} --dataset {data}"
+
+
+@app.command("train-fusion")
+def train_fusion(
+    dataset: Annotated[list[Path], typer.Option(help="a simulated world with depth maps; repeat")],
+    validation: Annotated[list[Path], typer.Option(help="such a world, not trained on; repeat")],
+    output: Annotated[Path, typer.Option(help="receives fusion.onnx")] = Path("runs/fusion"),
+    weights: Weights = "default",
+    samples: Annotated[int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")] = 4000,
+    steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Train the network that fuses learned and measured depth; OUTPUT is what depth.fusion of a run takes.
+
+    Example: erfsfm train-fusion --dataset worlds/0 --validation worlds/1 --output runs/fusion
+    """
+    from erfsfm.training.fusion import train_fusion as run_training
+
+    with progress_bar() as progress:
+        metrics = run_training(dataset, validation, output, weights, samples, steps, seed, _command(), progress)
+    print_rows([metrics], as_json)
+    if not as_json:
+        typer.echo(f"network in {output}: use it with --set depth.fusion={output}")
+
+
+@evaluate_app.command("depth")
+def evaluate_depth(
+    dataset: Annotated[
+        list[Path], typer.Option(help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat")
+    ],
+    weights: ManyWeights = ["default"],  # noqa: B006
+    truth: Annotated[
+        Literal["measured", "many-views"],
+        typer.Option(help="many-views: measured by optical flow at the poses of a run, for drives without true depth"),
+    ] = "measured",
+    sequence: Annotated[
+        list[str] | None, typer.Option(help="with many-views: recordings, or frames of one: 00[250:300]; repeat")
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="with many-views: folder that keeps poses and depth for the next time")
+    ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(help="frames of KITTI raw: eigen, a YAML split, or a file of lines 'drive frame' or image paths"),
+    ] = None,
+    fidelity: Fidelity = "default",
+    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
+    output: Annotated[Path | None, typer.Option(help="a file that receives the JSON as well")] = None,
+    device: Device = "auto",
+    seed: UnusedSeed = 0,
+    as_json: Json = False,
+) -> None:
+    """Depth errors under 80 m: Eigen's protocol with --split, else every fifth frame, and every street counts alike.
+
+    Standard errors are those over streets. Several weights are compared by the ratio of their abs_rel to that of the
+    first on each street, and by the geometric mean of the ratios. JSON has all errors. With --truth many-views no true
+    depth is needed: static surfaces are measured from their neighbouring frames.
+
+    Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
+    """
+    from erfsfm.evaluation.eigen import eigen_protocol
+    from erfsfm.evaluation.many_view_truth import many_view_protocol
+    from erfsfm.evaluation.protocols import depth_protocol
+    from erfsfm.inference import DepthPosePredictor
+
+    if truth == "many-views" and split is not None:
+        raise ConfigError("--truth many-views measures depth itself: leave --split out, name frames with --sequence")
+    if truth == "measured" and (sequence or cache):
+        raise ConfigError("--sequence and --cache belong to --truth many-views")
+    if fidelity == "paper" and split is None:
+        raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
+    if max(len(dataset), len(weights)) > 1 and (truth == "many-views" or split is not None):
+        raise ConfigError("--split and --truth many-views take one --dataset and one --weights")
+    names = weights if len(weights) > 1 else ["networks"]
+    networks = {name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)}
+    with progress_bar() as show:
+        if truth == "many-views":
+            rows = many_view_protocol(networks["networks"], dataset[0], sequence or (), cache, allow_leak, show)
+        elif split is None:
+            rows = depth_protocol(networks, dataset, allow_leak, show)
+        else:
+            rows = eigen_protocol(networks["networks"], dataset[0], split, fidelity, allow_leak)
+    _show(rows, output, as_json)
+
+
+def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
+    """Write the rows, if a file is named, and print them."""
+    from erfsfm.common.files import write_atomically
+
+    if output is not None:
+        write_atomically(output, lambda path: path.write_text(json.dumps(rows, indent=2) + "\n"))
+    print_rows(rows if as_json else _narrow(rows), as_json)
+
+
+def _narrow(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What of streets' rows fits into a table of 80 columns; other rows as they are."""
+    if "abs_rel_se" not in rows[0]:
+        return rows
+    compares = any("ratio" in row for row in rows)
+    shown = []
+    for row in rows:
+        head = {"street": row.get("street", "mean"), "weights": row["method"]}
+        errors = {"abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
+        if compares:
+            shown.append(head | errors | {"ratio": row.get("ratio"), "ratio se": row.get("ratio_se")})
+        else:
+            errors |= {key: row[key] for key in ("rmse", "a1", "images", "leak")}
+            shown.append({"method": row.get("street", row["method"])} | errors)
+    return shown
+
+
+@evaluate_app.command("pose")
+def evaluate_pose(
+    dataset: Annotated[Path, typer.Option(help="a KITTI odometry root with poses")],
+    sequence: Annotated[list[str], typer.Option(help="sequence names, or frames of one: 00[250:300]; repeat")],
+    weights: Weights = "default",
+    fidelity: Fidelity = "default",
+    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
+    device: Device = "auto",
+    seed: UnusedSeed = 0,
+    as_json: Json = False,
+) -> None:
+    """Five-frame snippet ATE and RE, beside constant velocity straight ahead as a baseline.
+
+    Example: erfsfm evaluate pose --weights default --dataset KITTI --sequence 09 --sequence 10
+    """
+    from erfsfm.evaluation.protocols import pose_protocol
+    from erfsfm.inference import DepthPosePredictor
+
+    predictor = DepthPosePredictor.from_weights(weights, device)
+    print_rows(pose_protocol(predictor, dataset, sequence, fidelity, allow_leak), as_json)
 
 
 @app.command()
@@ -38,16 +252,8 @@ def predict(
 
     Example: erfsfm predict drive/images --weights default --output depth
     """
-    from erfsfm.common.errors import DataError
     from erfsfm.common.readers.images import list_images
-    from erfsfm.inference import (
-        DepthPosePredictor,
-        colour_disparity,
-        is_prediction,
-        read_image,
-        save_depth,
-        save_image,
-    )
+    from erfsfm.inference import DepthPosePredictor, colour_disparity, read_image, save_depth, save_image
 
     if output.is_file():
         raise DataError(f"{output} is a file: give a folder as --output")
@@ -59,7 +265,7 @@ def predict(
     for file in files:
         depth_file = output / f"{file.stem}.npy"
         found = [path for path in (depth_file, depth_file.with_suffix(".png")) if path.exists()]
-        if found and not is_prediction(depth_file):
+        if len(found) == 1:
             raise DataError(f"{found[0]} is no earlier prediction and would be replaced: choose another --output")
     predictor = DepthPosePredictor.from_weights(weights, device)
     unreadable = []
@@ -68,10 +274,6 @@ def predict(
         try:
             image = read_image(file)
         except DataError as error:
-            if depth_file.exists():
-                raise DataError(
-                    f"{error}; {depth_file} is of an earlier image: remove it, or restore the image"
-                ) from error
             unreadable.append(str(error))
             continue
         output.mkdir(parents=True, exist_ok=True)
@@ -98,7 +300,7 @@ def networks(
     """
     from erfsfm.networks.presets import describe
 
-    summaries = [asdict(summary) for summary in describe(fidelity, width, sources)]
+    summaries = describe(fidelity, width, sources)
     if as_json:
         typer.echo(json.dumps(summaries, indent=2))
         return
@@ -132,13 +334,11 @@ def receptive_field(
     import torch
 
     from erfsfm.checkpoint import load_model
-    from erfsfm.common.errors import DataError
     from erfsfm.common.files import require_figure
     from erfsfm.common.readers.images import list_images, resize_image
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
-    from erfsfm.receptive_field.figure import draw_fields
-    from erfsfm.receptive_field.measure import field_table, measure_fields, street_snippet
+    from erfsfm.receptive_field import draw_fields, field_table, measure_fields, street_snippet
 
     require_figure(output)
     if images is None:
@@ -180,8 +380,7 @@ def convert(
     """
     from erfsfm.convert import convert as run_conversion
 
-    command = shlex.join(["erfsfm", *sys.argv[1:]])
-    for old in run_conversion(files, output, dilated, (height, width), trained_on or (), command):
+    for old in run_conversion(files, output, dilated, (height, width), trained_on or (), _command()):
         size = sum(value.numel() for value in old.tensors.values())
         typer.echo(f"{old.kind}: {old.preset}, {size:,} weights from {old.path}")
     if not trained_on:
@@ -212,6 +411,18 @@ def export(
         return
     for file in files:
         typer.echo(f"{file.kind}: {file.preset} in {file.path}; differs from PyTorch by {file.difference:.1e}")
+
+
+def print_rows(rows: list[dict[str, Any]], as_json: bool) -> None:
+    """A table with a row a line and the keys as its head; or JSON."""
+    if as_json:
+        typer.echo(json.dumps(rows, indent=2))
+    else:
+        table_of(rows).print()
+
+
+def _command() -> str:
+    return shlex.join(["erfsfm", *sys.argv[1:]])
 
 
 def main() -> None:

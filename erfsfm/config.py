@@ -16,7 +16,6 @@ Fidelity = Literal["default", "paper"]
 TrainedNetworks = Literal["both", "depth", "pose"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 _COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
-_LAST_MAP_ONE_PIXEL = 128  # pixels of an image; seven convolutions halve it
 
 
 class NetworkConfig(Section):
@@ -36,9 +35,6 @@ class NetworkConfig(Section):
         default="relu", description="leaky: leaky ReLU, for narrow decoders in which all ReLUs may die"
     )
     sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
-    masks: bool = Field(
-        default=False, description="explainability masks from a second head of the pose network; needs loss.mask_weight"
-    )
     alignment: Literal["none", "images"] = Field(
         default="none", description="images: outside training the pose network's rotations are measured in the images"
     )
@@ -48,10 +44,7 @@ class NetworkConfig(Section):
     @model_validator(mode="after")
     def _can_be_halved(self) -> Self:
         if self.alignment == "images" and (self.height % _COARSEST or self.width % _COARSEST):
-            raise ValueError(
-                f"network.alignment: images needs a height and width that are multiples of {_COARSEST}; got "
-                f"{self.height} and {self.width}"
-            )
+            raise ValueError(f"network.alignment: images needs a height and width that are multiples of {_COARSEST}")
         return self
 
 
@@ -95,9 +88,6 @@ class DataConfig(Section):
     validation_snippets: int = Field(default=60, ge=1, description="number of snippets in each validation")
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
     zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
-    roll: float = Field(
-        default=0.0, ge=0, le=30, description="largest roll of the camera in labelled single images, degrees"
-    )
     colour_jitter: float = Field(
         default=0.0, ge=0, le=0.5, description="largest relative change of brightness, contrast, gamma"
     )
@@ -133,9 +123,6 @@ class LossConfig(Section):
         default="depth-second-order", description="smoothed quantity and order of its derivative"
     )
     smoothness_weight: float = Field(default=0.2, ge=0, description="weight of the smoothness term")
-    mask_weight: float = Field(
-        default=0.0, ge=0, description="weight of the explainability regularisation; needs network.masks"
-    )
 
 
 class TeacherConfig(Section):
@@ -260,19 +247,11 @@ class ExperimentConfig(Section):
     @property
     def single_images(self) -> bool:
         """Whether labels of depth are all that is learned from, so that a sample needs no other view."""
-        by_images = self.loss.photometric_weight + self.loss.smoothness_weight > 0 or self.network.masks
+        by_images = self.loss.photometric_weight + self.loss.smoothness_weight > 0
         return self.training.networks == "depth" and self.teacher.structure_weight > 0 and not by_images
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
-        if self.loss.mask_weight > 0 and not self.network.masks:
-            raise ValueError("loss.mask_weight needs network.masks: true")
-        both_by_images = self.training.networks == "both" and self.loss.photometric_weight > 0
-        if self.network.masks and self.loss.mask_weight == 0 and both_by_images:
-            raise ValueError(
-                "network.masks needs a loss.mask_weight above 0 (Zhou et al. 2017 take 0.2): without it masks of zero "
-                "have the least loss, and nothing else is learned"
-            )
         if self.data.exact > 0 and (self.teacher.views == "exact" or self.teacher.structure_weight == 0):
             raise ValueError(
                 "data.exact needs teacher.views: many or network, the labels of the rest of each batch, and a "
@@ -296,13 +275,6 @@ class ExperimentConfig(Section):
             )
         if self.training.minutes > 0 and self.training.devices > 1:
             raise ValueError("training.minutes needs training.devices: 1: the clocks of several would differ")
-        network, plain = self.network, any("lite0" not in name for name in (self.network.depth, self.network.pose))
-        one_pixel = max(network.height, network.width) <= _LAST_MAP_ONE_PIXEL
-        if plain and network.normalisation == "batch" and self.training.batch == 1 and one_pixel:
-            raise ValueError(
-                f"network.normalisation: batch has one value to normalise in a batch of one {network.height}x"
-                f"{network.width} image: training.batch must be 2 or more, or the images larger than 128 pixels"
-            )
         return self
 
 

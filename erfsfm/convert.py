@@ -45,7 +45,6 @@ class OldNetwork:
     preset: str
     width: float
     sources: int
-    masks: bool
     tensors: dict[str, Tensor]
 
 
@@ -71,9 +70,7 @@ def convert(
         CheckpointError: unreadable, of another kind, or two of one kind; one line.
     """
     if (output / "model.yaml").exists():
-        raise CheckpointError(
-            f"{output} holds weights already: name both checkpoints in one command, or another folder"
-        )
+        raise CheckpointError(f"{output} holds weights already: name both checkpoints in one command")
     networks: dict[NetworkKind, OldNetwork] = {}
     for file in files:
         network = read_old(file, dilated)
@@ -81,9 +78,7 @@ def convert(
             raise CheckpointError(f"{networks[network.kind].path} and {file} both hold a {network.kind} network")
         networks[network.kind] = network
     if dilated and "pose" not in networks:
-        raise CheckpointError(
-            "dilated needs a pose network, and no pose network was given; the reference's dilated DispNetS cannot run"
-        )
+        raise CheckpointError("dilated needs a pose network: the reference's dilated DispNetS cannot run")
     record = ModelRecord(
         network=_config(networks, size),
         networks="both" if len(networks) == 2 else next(iter(networks)),
@@ -137,7 +132,6 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
         preset=preset,
         width=first.shape[0] / _FIRST_CHANNELS[kind],
         sources=len(head) // 6 if head is not None else 4,
-        masks=any(name.startswith("mask_decoder.") for name in renamed),
         tensors=renamed,
     )
 
@@ -150,9 +144,7 @@ def _tensors(path: Path) -> dict[str, Tensor]:
             warnings.filterwarnings("ignore", message="Detected pickle protocol")
             loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        raise CheckpointError(
-            f"{path} is damaged, no checkpoint, or would execute code when read: refused; get it from its authors again"
-        ) from error
+        raise CheckpointError(f"{path} is damaged, no checkpoint, or would execute code: get it again") from error
     except MemoryError:
         raise
     except Exception as error:  # a damaged file makes PyTorch raise anything, failed assertions too
@@ -171,8 +163,10 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
         encoder, decoder = _ENCODER.fullmatch(name), _DECODER.fullmatch(name)
         if encoder:
             layers.setdefault((int(encoder["stage"]), int(encoder["place"])), {})[encoder["rest"]] = value
+        elif decoder and kind == "pose":
+            continue  # explainability masks: only training would need them
         elif decoder:
-            renamed[_decoder_name(kind, decoder["block"], int(decoder["level"]), decoder["rest"])] = value
+            renamed[_decoder_name(decoder["block"], int(decoder["level"]), decoder["rest"])] = value
         elif name.startswith("pose_pred."):
             renamed[name.replace("pose_pred.", "pose_head.", 1)] = value
         else:
@@ -189,13 +183,11 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
     return renamed, tuple(sorted(stages))
 
 
-def _decoder_name(kind: NetworkKind, block: str, level: int, rest: str) -> str:
+def _decoder_name(block: str, level: int, rest: str) -> str:
     """Our lists run from the coarsest level to the finest; the old names count from the finest."""
     if block == "predict_disp":
         return f"heads.{4 - level}.{rest.removeprefix('0.')}"
-    if block == "predict_mask":
-        return f"mask_decoder.heads.{4 - level}.{rest}"
-    return f"{block}s.{7 - level}.{rest}" if kind == "depth" else f"mask_decoder.upconvs.{5 - level}.{rest}"
+    return f"{block}s.{7 - level}.{rest}"
 
 
 def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -233,12 +225,10 @@ def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -
     for kind, network in networks.items():
         settings |= {kind: network.preset, f"{kind}_width": network.width}
     if "pose" in networks:
-        settings |= {"sources": networks["pose"].sources, "masks": networks["pose"].masks}
+        settings |= {"sources": networks["pose"].sources}
     try:
         return NetworkConfig.model_validate(settings)
     except ValidationError as error:
         first = error.errors()[0]
-        where, files = ".".join(map(str, first["loc"])), ", ".join(str(network.path) for network in networks.values())
-        raise CheckpointError(
-            f"{files}: no network of ours has {where} {first['input']}: {first['msg'].lower()}"
-        ) from error
+        where = ".".join(map(str, first["loc"]))
+        raise CheckpointError(f"no network of ours has {where} {first['input']}: {first['msg'].lower()}") from error

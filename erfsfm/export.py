@@ -6,21 +6,18 @@ The graphs are fixed to one image at the size of the weights: the maps of a defo
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import Absent, Model
 from erfsfm.common.errors import ExportError
 from erfsfm.common.files import is_foreign, write_atomically
-from erfsfm.common.onnx_session import open_session
-from erfsfm.config import NetworkConfig
+from erfsfm.common.threads import open_session
 from erfsfm.networks.presets import NetworkKind
 from erfsfm.networks.torch_network import exported
 
@@ -39,36 +36,16 @@ class Exported:
     difference: float
 
 
-class DepthGraph(nn.Module):
-    """``image`` ``(1, 3, H, W)`` to ``disparity`` ``(1, 1, H, W)``."""
-
-    inputs, output = ("image",), "disparity"
+class PoseGraph(nn.Module):
+    """``target`` ``(1, 3, H, W)`` and ``sources`` ``(1, N, 3, H, W)`` to ``T_source_target`` ``(1, N, 6)``."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
-        self.eval()
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Finest disparity, unscaled."""
-        disparity: Tensor = self.network(image)
-        return disparity
-
-
-class PoseGraph(nn.Module):
-    """``target`` ``(1, 3, H, W)`` and ``sources`` ``(1, N, 3, H, W)`` to ``T_source_target`` ``(1, N, 6)``."""
-
-    inputs, output = ("target", "sources"), "T_source_target"
-
-    def __init__(self, network: nn.Module, sources: int) -> None:
-        super().__init__()
-        self.network = network
-        self.sources = sources
-        self.eval()
 
     def forward(self, target: Tensor, sources: Tensor) -> Tensor:
         """Translation (unscaled) and XYZ Euler angles (radians) of each source, in time order."""
-        vectors: Tensor = self.network(target, [sources[:, k] for k in range(self.sources)])
+        vectors: Tensor = self.network(target, list(sources.unbind(1)))
         return vectors
 
 
@@ -91,50 +68,35 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
     """
     if path.suffix != ".onnx":
         raise ExportError(f"--output must end in .onnx; got {path}")
-    nets = {path: model.depth_net, pose_path(path): model.pose_net}
-    for file in (file for file, net in nets.items() if not isinstance(net, Absent)):
+    config = model.record.network
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(1 + config.sources, 3, 4, 8, generator=generator)
+    smooth = nn.functional.interpolate(coarse, size=(config.height, config.width), mode="bilinear")
+    noisy = torch.rand(*smooth.shape, generator=generator)
+    examples = [(2 * images[:1] - 1, 2 * images[None, 1:] - 1) for images in (smooth, noisy)]
+    wanted: list[tuple[NetworkKind, str, Path, nn.Module, dict[str, int]]] = []
+    if not isinstance(model.depth_net, Absent):
+        wanted.append(("depth", config.depth, path, model.depth_net, {"image": 0}))
+    if not isinstance(model.pose_net, Absent):
+        wanted.append(("pose", config.pose, pose_path(path), PoseGraph(model.pose_net), {"target": 0, "sources": 1}))
+    for _, _, file, _, _ in wanted:
         if is_foreign(file, _MARK):
             raise ExportError(f"{file} is none of ours and would be replaced: choose another --output")
-    config, generator = model.record.network, torch.Generator().manual_seed(seed)
     files = []
-    if not isinstance(model.depth_net, Absent):
-        graph = DepthGraph(model.depth_net)
-        files.append(_export(graph, _images(config, generator, ()), path, "depth", config.depth, model))
-    if not isinstance(model.pose_net, Absent):
-        examples = [
-            a + b for a, b in zip(_images(config, generator, ()), _images(config, generator, (config.sources,)))
-        ]
-        graph_of_pose = PoseGraph(model.pose_net, config.sources)
-        files.append(_export(graph_of_pose, examples, pose_path(path), "pose", config.pose, model))
+    for kind, preset, file, network, inputs in wanted:
+        given = [{name: example[which] for name, which in inputs.items()} for example in examples]
+        output = "disparity" if kind == "depth" else "T_source_target"
+        graph = exported(network.eval(), [*given[0].values()], [*inputs], [output])
+        content = _with_metadata(graph, kind, preset, model)
+        difference = max(_difference(network, content, each) for each in given)
+        if not difference <= TOLERANCE:
+            raise ExportError(
+                f"{file} was not written: onnxruntime differs from PyTorch by {difference:.1e} of the largest output "
+                f"of {preset}, more than {TOLERANCE:.0e}; report the versions of torch, onnx and onnxruntime"
+            )
+        write_atomically(file, lambda part, content=content: part.write_bytes(content))  # type: ignore[misc]
+        files.append(Exported(file, kind, preset, difference))
     return files
-
-
-def _export(
-    graph: DepthGraph | PoseGraph,
-    examples: Sequence[tuple[Tensor, ...]],
-    path: Path,
-    kind: NetworkKind,
-    preset: str,
-    model: Model,
-) -> Exported:
-    content = _with_metadata(exported(graph, examples[0], graph.inputs, [graph.output]), kind, preset, model)
-    difference = max(_difference(graph, content, example) for example in examples)
-    if not difference <= TOLERANCE:
-        raise ExportError(
-            f"{path} was not written: onnxruntime differs from PyTorch by {difference:.1e} of the largest output of "
-            f"{preset}, more than {TOLERANCE:.0e}; report the versions of torch, onnx and onnxruntime"
-        )
-    write_atomically(path, lambda temporary: temporary.write_bytes(content))
-    return Exported(path, kind, preset, difference)
-
-
-def _images(config: NetworkConfig, generator: torch.Generator, lead: tuple[int, ...]) -> list[tuple[Tensor, ...]]:
-    """A smooth and a noisy example, each a one-tuple ``(1, *lead, 3, H, W)`` in [-1, 1]."""
-    count = int(np.prod(lead, dtype=int))
-    coarse = torch.rand(count, 3, 4, 8, generator=generator)
-    smooth = nn.functional.interpolate(coarse, size=(config.height, config.width), mode="bilinear")
-    noisy = torch.rand(count, 3, config.height, config.width, generator=generator)
-    return [(2 * image.reshape(1, *lead, *image.shape[1:]) - 1,) for image in (smooth, noisy)]
 
 
 def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model) -> bytes:
@@ -156,13 +118,12 @@ def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model)
     return serialised
 
 
-def _difference(graph: nn.Module, content: bytes, example: tuple[Tensor, ...]) -> float:
+def _difference(network: nn.Module, content: bytes, inputs: dict[str, Tensor]) -> float:
     """Largest difference of the two outputs, relative to the largest output."""
     session = open_session(content, torch.get_num_threads())
-    names = [entry.name for entry in session.get_inputs()]
-    (answer,) = session.run(None, {name: tensor.numpy() for name, tensor in zip(names, example)})
+    (answer,) = session.run(None, {name: tensor.numpy() for name, tensor in inputs.items()})
     with torch.no_grad():
-        wanted: NDArray[np.float32] = graph(*example).numpy()
+        wanted = network(*inputs.values()).numpy()
     if answer.shape != wanted.shape:
         return float("inf")
     return float(np.abs(answer - wanted).max() / max(np.abs(wanted).max(), 1e-30))

@@ -225,10 +225,7 @@ class DepthPosePredictor:
     def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
         """The output of a network, refused where it is not finite: float16 weights may overflow in a forward pass."""
         if not np.isfinite(output).all():
-            raise CheckpointError(
-                f"the {kind} network of {self.origin} gives NaN or infinite values: its training diverged; use other "
-                "weights"
-            )
+            raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
         return output
 
     @staticmethod
@@ -295,13 +292,3 @@ def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
             np.save(file, depth)
 
     write_atomically(path, write)
-
-
-def is_prediction(depth_file: Path) -> bool:
-    """Whether a ``.npy`` file and the ``.png`` beside it look predicted: one a depth map of the other's size."""
-    try:
-        depth = np.load(depth_file, mmap_mode="r", allow_pickle=False)
-        size = read_image(depth_file.with_suffix(".png")).shape[:2]
-        return bool(depth.dtype == np.float32 and depth.shape == size)
-    except (OSError, ValueError, EOFError, AttributeError, DataError):
-        return False

@@ -6,16 +6,15 @@ import hashlib
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from erfsfm.common.config_tree import Section, first_problem
+from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
 from erfsfm.common.errors import CheckpointError
-from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import NetworkConfig
 
 FORMAT: Literal[1] = 1
@@ -48,6 +47,14 @@ class ModelRecord(Section):
     commit: str = ""
     command: str = ""
 
+    @field_validator("network", mode="before")
+    @classmethod
+    def _known_keys(cls, network: Any) -> Any:
+        """Weights of earlier versions have options that there are no more; their tensors tell whether they matter."""
+        if not isinstance(network, dict):
+            return network
+        return {key: value for key, value in network.items() if key in NetworkConfig.model_fields}
+
 
 def read_record(path: Path) -> ModelRecord:
     """Read a ``model.yaml``.
@@ -76,10 +83,7 @@ def find_weights(name_or_folder: str | Path) -> Path:
     if str(name_or_folder) in shipped:
         return SHIPPED / str(name_or_folder)
     if folder.is_dir():
-        raise CheckpointError(
-            f"{folder} holds no model.yaml: it is not an output folder of 'erfsfm train' (or training has not "
-            "written weights yet)"
-        )
+        raise CheckpointError(f"{folder} holds no model.yaml: it is no output folder of a training")
     raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
 
 

@@ -1,13 +1,12 @@
 """Accuracy and speed: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
 
 accuracy measures simulated worlds and KITTI sequences, full-size the same worlds and KITTI at the size of KITTI's
-cameras, ablation turns off one part at a time, maps the errors of the map with one of its parts turned off at a time,
-handheld cameras that are carried: data sets beside published marks, folders of images, simulated rooms.
+cameras, maps the errors of the map with one of its parts turned off at a time, handheld cameras that are carried: data
+sets beside published marks, folders of images, simulated rooms.
 Every run is a process and a folder of its own under --output. A successful one is not repeated as long as commit
 and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its reason.
 --jobs and --scheduler need Dask: pip install 'erfsfm-slam[cluster]'. A scheduler's workers need the same files at the
-same paths. kitti runs whole sequences of KITTI odometry, 09 and 10 first, and says first how long that will take. speed
-measures two checkouts in turn: time, memory and stages; nothing of it is kept.
+same paths. speed measures two checkouts in turn: time, memory and stages; nothing of it is kept.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -24,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from benchmarking import handheld, kitti, page, pairs
+from benchmarking import handheld, page, pairs
 from benchmarking import plan as p
 from benchmarking.metrics import rows
 from benchmarking.work import ROOT, measured, revision, simulate, workers
@@ -47,15 +46,12 @@ class Mode:
 
 
 _BOTH = ("loop", "straight")
-_ROOTS = ("kitti", "data", *handheld.ROOTS)  # options of data sets, which the page calls by these names
-# options that a section of the page does not state, or states by other names
-_UNSAID = {"mode", "output", "report", "jobs", "scheduler", "worlds_in", "drives", "folders", *_ROOTS}
+# options of paths, which the page calls by these names
+_PATHS = ("kitti", "data", *handheld.ROOTS, "output", "worlds_in", "against")
 MODES = {
     "accuracy": Mode("errors of all trajectories", p.ACCURACY, _BOTH, (610, 611), ("default", "sim"), (0, 1, 2)),
     "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", p.ACCURACY, _BOTH, (610, 611)),
-    "ablation": Mode("the same with one part turned off at a time", p.ABLATION, _BOTH, weights=("default", "sim")),
     "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", p.MAPS, ("loop",)),
-    "kitti": Mode("whole sequences of KITTI odometry, beside published errors", p.WHOLE, (), weights=("sim",)),
     "handheld": Mode("errors, losses and waits of cameras that are carried", p.ACCURACY, ()),
 }
 
@@ -63,11 +59,13 @@ MODES = {
 @one_line_errors()
 def main(words: Sequence[str] | None = None) -> None:
     """Plan the runs, execute those that are missing, write tables."""
+    words = sys.argv[1:] if words is None else words
     options = _parser().parse_args(words)
+    command = shlex.join(["python", "tools/benchmark.py", *words])
     if options.mode == "speed":
-        _compare_speed(options)
+        _compare_speed(options, command)
         return
-    jobs = _whole_sequences(options) if options.mode == "kitti" else _jobs(options)
+    jobs = _jobs(options)
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or a recording; see --help")
     with workers(options.jobs, options.scheduler) as spread:
@@ -75,17 +73,10 @@ def main(words: Sequence[str] | None = None) -> None:
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
     content = csv_of(table_of_runs).encode()
     write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(content))
-    drives = [(path, "DRIVE") for name in ("drives", "folders") for path in getattr(options, name, ())]
-    text = page.section(options.mode, _command(options), results, "several" if options.scheduler else str(options.jobs))
-    roots = [(getattr(options, name, None), name.upper()) for name in _ROOTS]
-    known = (options.output, "OUTPUT"), (getattr(options, "worlds_in", None), "WORLDS"), *roots, (ROOT, "."), *drives
-    for path, name in known:
-        text = text.replace(str(path.resolve()), name) if path else text
-    _write_section(options.report, text)
+    text = page.section(options.mode, command, results, "several" if options.scheduler else str(options.jobs))
+    _write_section(options, text)
     if options.mode in ("accuracy", "full-size"):
         print(page.summary_table(results))
-    if options.mode == "kitti":
-        print(kitti.tables(results))
     if options.mode == "handheld":
         print(page.handheld_summary(results))
     if options.mode == "accuracy" and page.drawable(results):
@@ -93,34 +84,38 @@ def main(words: Sequence[str] | None = None) -> None:
     print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
 
 
-def _write_section(report: Path, text: str) -> None:
+def _write_section(options: argparse.Namespace, text: str) -> None:
+    """Into the page, with names in place of the paths of one machine."""
+    folders = [*getattr(options, "drives", ()), *getattr(options, "folders", ())]
+    known = [(getattr(options, name, None), name.upper()) for name in _PATHS]
+    for path, name in (*known, *((folder.parent, folder.parent.name) for folder in folders), (ROOT, ".")):
+        for written in (str(path.resolve()), str(path)) if path else ():
+            text = text.replace(written, name)
+    report: Path = options.report
     old = report.read_text(encoding="utf-8") if report.is_file() else ""
     write_atomically(report, lambda file: file.write_text(page.with_section(old, text), encoding="utf-8"))
 
 
-def _compare_speed(options: argparse.Namespace) -> None:
+def _compare_speed(options: argparse.Namespace, command: str) -> None:
     """Write the section of two checkouts in turn."""
-    drives, command = [], ["python", "tools/benchmark.py", "speed", "--against", "CHECKOUT"]
+    drives = {}
     if options.kitti is not None:
-        drive = "--dataset", str(options.kitti.resolve()), "--sequence", options.sequence
-        drives.append(pairs.Drive(f"KITTI {options.sequence}", drive))
-        drives.append(pairs.Drive(f"KITTI {options.sequence}, no map", (*drive, "--set", "mapping.enabled=false")))
-        command += ["--kitti", "KITTI", "--sequence", options.sequence]
+        kitti = ["--dataset", str(options.kitti.resolve()), "--sequence", options.sequence]
+        drives[f"KITTI {options.sequence}"] = kitti
+        drives[f"KITTI {options.sequence}, no map"] = [*kitti, "--set", "mapping.enabled=false"]
     for folder in options.folders:
-        drives.append(pairs.Drive(folder.resolve().parent.name, ("--dataset", str(folder.resolve()))))
-        command += ["--folders", f"DATA/{folder.resolve().parent.name}/{folder.name}"]
+        drives[folder.resolve().parent.name] = ["--dataset", str(folder.resolve())]
     if options.frames:
         (grid,) = p.worlds((options.output / "worlds").resolve(), ["grid"], [610], options.frames)
         simulate(grid)
-        drives.append(pairs.Drive(f"grid 610, {options.frames} frames", ("--dataset", str(grid.root))))
-    command += ["--frames", str(options.frames), "--pairs", str(options.pairs)]
-    checkouts = options.against.resolve(), ROOT
+        drives[f"grid 610, {options.frames} frames"] = ["--dataset", str(grid.root)]
     runs = (options.output / "speed").resolve()
     shutil.rmtree(runs, ignore_errors=True)
     runs.mkdir(parents=True)
-    costs = pairs.in_turn(checkouts, drives, options.pairs, runs)
-    text = pairs.tables([revision(checkout) for checkout in checkouts], drives, costs)
-    _write_section(options.report, page.speed_section(shlex.join(command), text))
+    checkouts = zip(("before", "after"), (options.against.resolve(), ROOT))
+    named = {f"{when} ({revision(checkout)})": checkout for when, checkout in checkouts}
+    text = pairs.tables(pairs.in_turn(named, drives, options.pairs, runs))
+    _write_section(options, page.speed_section(command, text))
     print(text)
 
 
@@ -146,37 +141,6 @@ def _jobs(options: argparse.Namespace) -> list[p.Job]:
     return p.plan(folder, drives, configurations, *rest)
 
 
-def _whole_sequences(options: argparse.Namespace) -> list[p.Job]:
-    """The sequences that are there; says which are not, and how long the others take."""
-    root = options.kitti.resolve()
-    frames, absent = kitti.present(root, options.sequences)
-    for line in absent:
-        print(f"left out: {line}", file=sys.stderr)
-    if not frames:
-        raise SystemExit(f"nothing to measure: {root} has none of these with true poses; give another --kitti")
-    rest = options.weights, options.seeds, options.set, options.device
-    folder = options.output.resolve() / options.mode
-    jobs = p.plan(folder, p.recordings(root, list(frames), None), MODES["kitti"].configurations, *rest)
-    print(kitti.time_to_go(jobs, frames, options.jobs), file=sys.stderr)
-    return jobs
-
-
-def _command(options: argparse.Namespace) -> str:
-    """The command with its defaults, without the paths and hosts of one machine."""
-    words = ["python", "tools/benchmark.py", options.mode]
-    for name in _ROOTS:
-        words += [f"--{name.replace('_', '-')}", name.upper()] if getattr(options, name, None) else []
-    drives = getattr(options, "drives", ())
-    names = [f"KITTI_RAW/{drive.resolve().parent.name}/{drive.name}" for drive in drives]
-    words += ["--drives", *names] if names else []
-    folders = [f"DATA/{folder.resolve().parent.name}/{folder.name}" for folder in getattr(options, "folders", ())]
-    words += ["--folders", *folders] if folders else []
-    for name, value in vars(options).items():
-        if name not in _UNSAID and value not in (None, ()):
-            words += [f"--{name}", *map(str, value if isinstance(value, list | tuple) else [value])]
-    return shlex.join(words)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__doc__)
     modes = parser.add_subparsers(dest="mode", required=True, metavar="|".join([*MODES, "speed"]))
@@ -188,12 +152,12 @@ def _parser() -> argparse.ArgumentParser:
             data = os.environ.get("ERFSFM_DATA")
             add("--data", type=Path, default=data and Path(data), metavar="FOLDER", help="recordings; $ERFSFM_DATA")
         elif name != "handheld":
-            add("--kitti", type=Path, metavar="ROOT", required=name == "kitti", help="a KITTI odometry root to measure")
+            add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure")
             add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
         if name == "handheld":
             handheld.add_options(add)
             add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
-        elif name != "kitti":
+        else:
             _add_worlds(add, mode)
         add("--weights", nargs="+", default=mode.weights, help="names or folders")
         add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")
@@ -201,9 +165,9 @@ def _parser() -> argparse.ArgumentParser:
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
         add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
         add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
-        if name in ("accuracy", "ablation", "maps"):
+        if name in ("accuracy", "maps"):
             add("--excerpt", metavar="A:B", help="frames of the sequences of --kitti, half-open")
-        if name in ("maps", "ablation"):
+        if name == "maps":
             add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
             parts = [each.name for each in mode.configurations if each is not p.EVERYTHING]
             add("--parts", nargs="*", choices=parts, metavar="PART", help=f"to turn off: {', '.join(parts)}; else all")

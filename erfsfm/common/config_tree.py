@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,8 +11,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from erfsfm.common.errors import ConfigError
-from erfsfm.common.yaml_file import YamlError, parse_yaml, read_yaml
+from erfsfm.common.errors import ConfigError, ErfsfmError
+from erfsfm.common.files import read_text
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -95,7 +96,9 @@ def first_problem(error: ValidationError) -> str:
     """The first problem of a validation error as ``key: problem``, for small files that have no overrides."""
     first = error.errors(include_url=False)[0]
     place = ".".join(str(part) for part in first["loc"])
-    return f"{place or 'all of it'}: {first['msg'].removeprefix('Value error, ')}"
+    in_short = {"missing": "missing", "extra_forbidden": "unknown key"}
+    said = in_short.get(first["type"], first["msg"].removeprefix("Value error, "))
+    return f"{place}: {said}" if place else said
 
 
 def _read_tree(path: Path) -> dict[str, Any]:
@@ -169,3 +172,65 @@ def _known_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 def _shown(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+MAX_BYTES = 2**18
+
+
+class YamlError(ErfsfmError):
+    """Text or a file is not YAML that this project reads."""
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML file; None where it is empty.
+
+    Raises:
+        YamlError: missing, too large, not YAML, or a duplicate key; one line.
+    """
+    if not path.is_file():
+        raise YamlError(f"{path} is not there, or not a file")
+    try:
+        return parse_yaml(read_text(path, "utf-8", MAX_BYTES))
+    except OSError as error:
+        raise YamlError(f"{path} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise YamlError(f"{path} is not YAML: it is not UTF-8 text") from error
+    except YamlError as error:
+        raise YamlError(f"{path} is not YAML: {error}") from error
+
+
+def parse_yaml(text: str) -> Any:
+    """The value of a YAML text.
+
+    Raises:
+        YamlError: the problem and its line, in one line.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.YAMLError as error:
+        problem, mark = getattr(error, "problem", None) or str(error), getattr(error, "problem_mark", None)
+        raise YamlError(f"{problem} (line {mark.line + 1})" if mark else problem) from error
+    except (
+        ValueError,
+        TypeError,
+        RecursionError,
+    ) as error:  # a date that does not exist, a list for a key, endless lists
+        raise YamlError(str(error)) from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML where ``1e-4`` is a number, and duplicate keys are refused."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As the parent class, refusing duplicate keys."""
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.MarkedYAMLError(problem=f"duplicate key '{key}'", problem_mark=node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+# PyYAML follows YAML 1.1, where a float needs a dot
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)

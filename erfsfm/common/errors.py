@@ -1,8 +1,6 @@
 """The errors a user can cause; the command line prints them as one line and exits with 1."""
 
-import errno
 import os
-import re
 import traceback
 from pathlib import Path
 
@@ -14,12 +12,7 @@ SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 OUT_OF_MEMORY = (
     "memory ran out; what was written stays: use fewer frames or smaller images, or a machine with more memory"
 )
-# what libraries in C++ say when memory ran out, whatever they raise
-_MEMORY = re.compile(
-    r"(not enough|insufficient|cannot allocate|shared) memory|bad_?alloc|could not create a primitive"
-    r"|failed to map segment|can't start new thread|pthread_create|DataLoader worker .* (exited|killed)",
-    re.IGNORECASE,
-)
+_MEMORY = ("not enough memory", "cannot allocate memory", "bad_alloc", "bad alloc", "can't start new thread")
 
 
 def one_line(text: str) -> str:
@@ -42,12 +35,11 @@ class OneLineError(Exception):
 
 def explained(error: Exception) -> str:
     """Any error in one line; one that was not foreseen with its place."""
-    if isinstance(error, MemoryError) or _MEMORY.search(str(error)):
+    said = str(error).lower()
+    if isinstance(error, MemoryError) or any(words in said for words in _MEMORY):
         return OUT_OF_MEMORY
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return one_line(f"{error.filename}: {error.strerror}: check the path")
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.strerror:
-        return f"{error.strerror}: standard output, or the folder for temporary files; what was written stays"
     if isinstance(error, OneLineError | OSError):
         return one_line(str(error))
     place = traceback.extract_tb(error.__traceback__)[-1]

@@ -137,9 +137,7 @@ class FolderLock(ExitStack):
         try:
             self._lock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise BusyError(
-                f"another process writes to {folder}: wait for its end, or choose another --output"
-            ) from error
+            raise BusyError(f"another process writes to {folder}: wait, or choose another --output") from error
 
     def wait_for(self, folder: Path) -> None:
         """Hold a folder as soon as no other process does; else as `take`."""

@@ -1,13 +1,17 @@
-"""How many threads libraries may start, without importing torch."""
+"""How many threads libraries may start, and ONNX Runtime on a number of them, without importing torch."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import cv2
 from threadpoolctl import threadpool_limits
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
 
 
 def usable_cores() -> int:
@@ -44,3 +48,18 @@ def limit_library_threads() -> Iterator[None]:
     """OpenCV and BLAS compute in the calling threads alone, for programs that run several threads of their own."""
     with opencv_threads(1), threadpool_limits(1, "blas"):
         yield
+
+
+_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
+
+
+def open_session(content: bytes, threads: int) -> InferenceSession:
+    """A graph that is ready to run on that many threads; the exceptions of ONNX Runtime are raised as they are."""
+    from onnxruntime import InferenceSession, SessionOptions
+
+    options = SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _FATAL
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # costly on a shared machine
+    return InferenceSession(content, options, providers=["CPUExecutionProvider"])

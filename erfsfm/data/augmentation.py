@@ -1,8 +1,6 @@
-"""Random flip, scale-crop and colour of a whole snippet, with its camera."""
+"""Random flip, scale-crop, colour and weather of a whole snippet, with its camera."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -43,30 +41,6 @@ def augment(
     return images, maps, camera, mirrored
 
 
-def rolled(
-    image: NDArray[np.uint8], maps: Maps, camera: Camera, angle: float, unknown: Sequence[float]
-) -> tuple[NDArray[np.uint8], Maps]:
-    """The image ``(H, W, 3)`` and maps of the camera turned about its optical axis, which leaves z-depth as it is.
-
-    Args:
-        image: of the camera.
-        maps: ``(H, W)`` each.
-        camera: of them.
-        angle: radians.
-        unknown: value of each map beyond the image's edges, where the image is mirrored.
-    """
-    K = camera.K.astype(np.float64)
-    cos, sin = np.cos(angle), np.sin(angle)
-    move = (K @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ np.linalg.inv(K))[:2]
-    size = (camera.width, camera.height)
-    turned = cv2.warpAffine(image, move, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    nearest = [
-        cv2.warpAffine(values, move, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=value)
-        for values, value in zip(maps, unknown, strict=True)
-    ]
-    return np.asarray(turned, np.uint8), nearest
-
-
 def _scale_crop(
     images: Images, maps: Maps, camera: Camera, zoom: float, fidelity: Fidelity, rng: np.random.Generator
 ) -> tuple[Images, Maps, Camera]:
@@ -97,3 +71,96 @@ def _recolour(images: Images, strength: float, rng: np.random.Generator) -> Imag
         images = [cv2.cvtColor(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) for i in images]
         table = np.repeat(table[..., :1], 3, axis=-1)
     return [cv2.LUT(image, table) for image in images]
+
+
+Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
+
+_EACH = 0.6  # chance of each
+_BLUR_SAMPLES = 6  # images averaged into a blurred one
+
+
+def weathered(images: Images, rng: np.random.Generator) -> Images:
+    """The same views under random weather; positions of pixels do not change. A single image may get cast shadows.
+
+    Args:
+        images: ``(H, W, 3)`` uint8 each, in time order.
+        rng: of all random draws.
+    """
+    exposure, blur, rain, shadow = rng.random(4) < _EACH
+    seen: Pictures = [np.asarray(image / 255, dtype=np.float32) for image in images]
+    if shadow and len(seen) == 1:  # those of a snippet would have to move with the road
+        seen = [_shadowed(seen[0], rng)]
+    if blur:
+        seen = _blurred(seen, rng)
+    if exposure:
+        seen = _exposed(seen, rng)
+    if rain:
+        seen = _rained_on(seen, rng)
+    return [np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in seen]
+
+
+def _shadowed(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Shadows with soft edges below the upper third: bands across the image, or the spots of leaves."""
+    height, width = image.shape[:2]
+    shade = np.zeros((height, width), np.float32)
+    if rng.random() < 0.5:
+        for _ in range(int(rng.integers(1, 4))):
+            ends = rng.uniform(0.35, 1.1, 2) * height
+            thickness = rng.uniform(0.02, 0.3, 2) * height
+            corners = [(0, ends[0]), (width, ends[1]), (width, ends[1] + thickness[1]), (0, ends[0] + thickness[0])]
+            cv2.fillConvexPoly(shade, np.rint(corners).astype(np.int32), 1.0)
+    else:
+        cells = (max(2, int(rng.integers(6, 24))), max(2, int(rng.integers(8, 32))))
+        spots = cv2.resize(rng.random(cells).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        shade[spots < rng.uniform(0.3, 0.6)] = 1
+        shade[: int(rng.uniform(0.35, 0.6) * height)] = 0
+    shade = cv2.GaussianBlur(shade, (0, 0), float(rng.uniform(0.5, 2.5)))[..., None]
+    dark = rng.uniform(0.15, 0.6) * np.array([1, 1, rng.uniform(1, 1.2)])  # the sky's light is bluer than the sun's
+    return np.asarray(image * (1 - shade * (1 - dark.astype(np.float32))), np.float32)
+
+
+def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
+    """Motion blur of a camera that translates and rotates during the exposure."""
+    height, width = images[0].shape[:2]
+    approach = float(rng.uniform(0, 0.08))
+    yaw = float(rng.normal(0, 0.01)) * width
+    rise = float(rng.normal(0, 0.005)) * height
+    centre = np.array([width - 1, height - 1]) / 2
+    moves = []
+    for time in np.linspace(-0.5, 0.5, _BLUR_SAMPLES):
+        zoom = 1 + time * approach
+        shift = (1 - zoom) * centre + time * np.array([yaw, rise])
+        moves.append(np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]]))
+    border = cv2.BORDER_REPLICATE
+    blurred = [
+        np.mean([cv2.warpAffine(image, move, (width, height), borderMode=border) for move in moves], axis=0)
+        for image in images
+    ]
+    return [np.asarray(image, dtype=np.float32) for image in blurred]
+
+
+def _exposed(images: Pictures, rng: np.random.Generator) -> Pictures:
+    """A random gain and gamma, with a jump at a random frame."""
+    jump = int(rng.integers(len(images) + 1))
+    before, after = ((float(rng.uniform(0.5, 1.6)), float(rng.uniform(0.7, 1.4))) for _ in range(2))
+    chosen = [before if k < jump else after for k in range(len(images))]
+    return [np.float32(gain) * np.power(image, np.float32(gamma)) for image, (gain, gamma) in zip(images, chosen)]
+
+
+def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
+    """Reduced contrast for the whole snippet, and rain streaks of each frame."""
+    height, width = images[0].shape[:2]
+    veil, grey = float(rng.uniform(0, 0.35)), float(rng.uniform(0.3, 0.8))
+    density, strength = float(rng.uniform(0.001, 0.01)), float(rng.uniform(0.1, 0.5))
+    length = max(3, int(height * rng.uniform(0.04, 0.14)))
+    slant = float(rng.uniform(-0.4, 0.4))
+    streak = np.zeros((length, length), np.float32)
+    rows = np.arange(length)
+    streak[rows, np.clip(np.rint(length / 2 + slant * (rows - length / 2)), 0, length - 1).astype(int)] = 1
+    wet = []
+    for image in images:
+        drops = (rng.random((height, width)) < density).astype(np.float32)
+        cover = np.minimum(cv2.filter2D(drops, -1, streak), 1)[..., None] * np.float32(strength)
+        hazy = image + np.float32(veil) * (np.float32(grey) - image)
+        wet.append(hazy + cover * (np.float32(0.9) - hazy))
+    return wet

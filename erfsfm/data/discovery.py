@@ -11,10 +11,12 @@ from pathlib import Path
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
 from erfsfm.common.readers.images import first_size, image_folder, list_images, recording_name
-from erfsfm.common.readers.kitti_calibration import CAM_TO_CAM, ODOMETRY_CALIBRATION, CalibrationFile
-from erfsfm.common.readers.kitti_drives import (
+from erfsfm.common.readers.kitti import (
+    CAM_TO_CAM,
+    ODOMETRY_CALIBRATION,
     ODOMETRY_CAMERAS,
     RAW_CAMERAS,
+    CalibrationFile,
     OdometryRoot,
     drive_name,
     find_drives,

@@ -1,6 +1,7 @@
 """The many-view teacher of whole drives: poses by the SLAM system once a drive, then a label for every few frames.
 
-All of it is kept in a folder under a digest of the drive's images and camera, so that it is computed once.
+All of it is kept in a folder under a digest of the drive's images and camera, so that it is computed once. In a
+prepared folder a label is a small picture: bounds are rounded by a third of a sigma on average.
 """
 
 from __future__ import annotations
@@ -25,17 +26,15 @@ from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.common.threads import limit_library_threads
 from erfsfm.data.array_cache import ArrayCache
-from erfsfm.data.compact_label import decode
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
-from erfsfm.labels.many_views import NEIGHBOURS, label
-from erfsfm.labels.refined_depth import in_camera_heights, refined_label, shrunk
+from erfsfm.labels.many_views import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
 from erfsfm.labels.structure import TeacherStructure
 from erfsfm.mvs.flow import Grey, measure
 from erfsfm.mvs.views import neighbours_around
 
-VERSION = 3
+VERSION = 4
 # pixels of the images that flow alone measures: finer flow is slower and no surer; twice the networks' width would
 # shift labels, sampled by nearest, by half a pixel
 LARGEST_WIDTH = 800
@@ -107,9 +106,7 @@ class DriveLabels:
             with np.load(path, allow_pickle=False) as entry:
                 return entry["least"], entry["most"]
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise TrainingError(
-                f"the teacher's label {path} is damaged or missing: delete it and start again ({error})"
-            ) from error
+            raise TrainingError(f"the teacher's label {path} is damaged: delete it, start again ({error})") from error
 
     def measure_poses(self, weights: str) -> None:
         """Run the SLAM system on the drive and keep its poses."""
@@ -298,10 +295,7 @@ class ManyViewTeacher:
         without = [drive for drive in drives if not drive.poses_file.is_file()]
         for drive in drives:
             if drive.compact and (drive in without or (self.measures != "poses" and any(_missing(drive, sources)))):
-                raise TrainingError(
-                    f"{drive.folder} holds not all labels of many views that are wanted: prepare the data again with "
-                    "this teacher and this size of the networks"
-                )
+                raise TrainingError(f"{drive.folder} lacks labels: prepare the data again with this teacher and size")
         for done, drive in enumerate(without):
             progress("teacher: poses", done, len(without))
             drive.measure_poses(weights)
@@ -325,20 +319,11 @@ class ManyViewTeacher:
                 progress("teacher: depth", done, total)
 
     def _digest(self, recording: Recording) -> str:
-        """Of the images, the camera, and the version of this file; kept by names, sizes and times of the images."""
-        images = sorted(set(recording.images))
-        start = f"{VERSION} {recording.camera} {recording.start} {len(recording)}"
-        files = [(path, path.stat()) for path in images]
-        seen = "\n".join([start, *(f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in files)])
-        kept = self._folder / "digests" / hashlib.sha256(seen.encode()).hexdigest()[:_DIGITS]
-        if kept.is_file() and len(known := kept.read_text()) == _DIGITS:
-            return known
-        digest = hashlib.sha256(start.encode())
-        for path in images:
-            digest.update(path.read_bytes())
-        known = digest.hexdigest()[:_DIGITS]
-        write_atomically(kept, lambda path: path.write_text(known), sync=False)
-        return known
+        """Of the camera, the names, sizes and times of the images, and the version of this file."""
+        stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
+        seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
+        seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
+        return hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
 
 
 def _missing(drive: DriveLabels, sources: int) -> Iterator[list[int]]:
@@ -360,3 +345,58 @@ def _save(path: Path, array: NDArray[Any]) -> None:
 def _compress(path: Path, **arrays: NDArray[Any]) -> None:
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+SMALLEST = 0.002  # inverse depth of code 0, one over camera heights: 800 m; code 255 is 0.7 m
+STEP = 0.0275  # of the logarithm of the inverse depth between codes
+LEAST_SIGMA = 0.01  # of the logarithm, of the first kind of measured pixel
+_UNKNOWN, _AT_LEAST, _AT_MOST, _MEASURED = range(4)  # kinds of pixels; each further kind has twice the sigma
+_WIDEST = 8
+_LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]
+
+Bound = NDArray[np.float16]
+
+
+def encode(least: NDArray[np.floating], most: NDArray[np.floating]) -> bytes:
+    """The file of a label with these bounds, ``(H, W)`` each: 0 and infinite where unknown."""
+    has_least, has_most = least > 0, np.isfinite(most)
+    measured = has_least & has_most
+    known = has_least | has_most
+    low = np.log(np.where(has_least, least, np.where(known, most, 1)).astype(np.float32))
+    high = np.log(np.where(has_most, most, np.where(known, least, 1)).astype(np.float32))
+    sigma = np.maximum((high - low) / 2, LEAST_SIGMA)
+    doublings = np.clip(np.rint(np.log2(sigma / LEAST_SIGMA)), 0, _WIDEST)
+    one_sided = np.where(has_least, _AT_LEAST, np.where(has_most, _AT_MOST, _UNKNOWN))
+    kind = np.where(measured, _MEASURED + doublings, one_sided)
+    steps = np.where(measured, np.maximum(np.floor(LEAST_SIGMA * 2**doublings / STEP), 1), 1)
+    code = (low + high - 2 * np.log(SMALLEST)) / (2 * STEP)
+    code = np.clip(np.rint(code / steps) * steps, 0, 255)
+    picture = np.zeros((*least.shape, 3), np.uint8)
+    picture[..., 0], picture[..., 1] = kind, _continued(code.astype(np.uint8), known)
+    return bytes(cv2.imencode(".webp", picture, _LOSSLESS)[1])
+
+
+def decode(data: bytes) -> tuple[Bound, Bound]:
+    """Least and most inverse depth ``(H, W)``.
+
+    Raises:
+        ValueError: these bytes are no label.
+    """
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if picture is None:
+        raise ValueError("it is no picture")
+    kinds = np.arange(256)
+    measured, codes = kinds >= _MEASURED, np.arange(256)
+    sigma = np.where(measured, LEAST_SIGMA * 2.0 ** np.clip(kinds - _MEASURED, 0, _WIDEST), 0)
+    value = SMALLEST * np.exp(STEP * codes)
+    bounded_below, bounded_above = measured | (kinds == _AT_LEAST), measured | (kinds == _AT_MOST)
+    ratio_least = np.where(bounded_below, np.exp(-sigma), 0).astype(np.float32)
+    ratio_most = np.where(bounded_above, np.exp(sigma), np.inf).astype(np.float32)
+    kind, middle = picture[..., 0], value.astype(np.float32)[picture[..., 1]]
+    return (middle * ratio_least[kind]).astype(np.float16), (middle * ratio_most[kind]).astype(np.float16)
+
+
+def _continued(code: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Unknown pixels with the code of the known pixel left of them: small when compressed."""
+    columns = np.where(known, np.arange(code.shape[1]), 0)
+    return np.asarray(np.take_along_axis(code, np.maximum.accumulate(columns, axis=1), axis=1))

@@ -19,13 +19,11 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
-from erfsfm.common.config_tree import Section, dump_yaml, first_problem
+from erfsfm.common.config_tree import Section, YamlError, dump_yaml, first_problem, read_yaml
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress
-from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import NetworkConfig
-from erfsfm.data.compact_label import encode
-from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher
+from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher, encode
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import Snippet
 from erfsfm.geometry.camera import Camera

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from erfsfm.common.config_tree import Section, first_problem
+from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
 from erfsfm.common.errors import DataError
-from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import config_folders
 
 _FRAMES = re.compile(r"(?P<recording>.+)\[(?P<runs>[\d:, ]+)\]")
@@ -61,9 +60,7 @@ def read_split_file(name_or_path: str) -> Split:
     except YamlError as error:
         raise DataError(str(error)) from error
     except ValidationError as error:
-        raise DataError(
-            f"{path} is no split, a file of the lists train, validation and test: {first_problem(error)}"
-        ) from error
+        raise DataError(f"{path} is no split of train, validation and test: {first_problem(error)}") from error
 
 
 def _folders() -> list[Path]:

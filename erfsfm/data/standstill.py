@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.kitti_sensors import velocity
+from erfsfm.common.readers.kitti import velocity
 from erfsfm.data.recordings import Recording
 
 logger = logging.getLogger(__name__)

@@ -92,9 +92,7 @@ def eigen_protocol(
         guess = _depth(networks, image, fidelity)
         found = _compare(guess, truth, "median", fidelity)
         if found is None:
-            raise DataError(
-                f"the LiDAR of {frame.drive} frame {frame.index} hits nothing under {CAP_M:g} m in the crop"
-            )
+            raise DataError(f"the LiDAR of {frame.name} hits nothing under {CAP_M:g} m in the crop")
         errors["gt-median"].append(found)
         road = _compare(flat_road_depth(frame, image.shape[:2], _FLAT_ROAD_M), truth, "median", fidelity)
         flat += [road] if road is not None else []

@@ -202,7 +202,5 @@ def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: b
     leaked = networks.leaks(names)
     if leaked and not allow_leak:
         some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")
-        raise DataError(
-            f"leak: these weights were trained on {some}; choose other weights or data, or allow it with --allow-leak"
-        )
+        raise DataError(f"leak: these weights were trained on {some}; choose other weights or data, or --allow-leak")
     return bool(leaked)

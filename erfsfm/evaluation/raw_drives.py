@@ -1,7 +1,7 @@
 """Single frames of KITTI raw drives: the images around one, its LiDAR depth, and how far the car moved.
 
 Layout: ``ROOT/2011_09_26/2011_09_26_drive_0013_sync/{image_02,velodyne_points,oxts}/data``, calibration in the folder
-of the date (`erfsfm.common.readers.kitti_drives`). Images may be smaller than the original; the calibration follows.
+of the date (`erfsfm.common.readers.kitti`). Images may be smaller than the original; the calibration follows.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.kitti_calibration import (
+from erfsfm.common.readers.kitti import (
     ASPECT_TOLERANCE,
     CAM_TO_CAM,
     CAMERA_HEIGHT_M,
     VELO_TO_CAM,
     CalibrationFile,
     FloatArray,
+    velocity,
 )
-from erfsfm.common.readers.kitti_sensors import velocity
 from erfsfm.config import Fidelity
 
 _FRAME = re.compile(
@@ -57,10 +57,7 @@ class RawFrame:
         """
         match = _FRAME.fullmatch(line.strip())
         if match is None:
-            raise DataError(
-                f"'{line.strip()}' names no frame: wanted 2011_09_26/2011_09_26_drive_0013_sync/image_02/data/"
-                "0000000005.png, or 2011_09_26_drive_0013 5"
-            )
+            raise DataError(f"'{line.strip()}' names no frame: wanted the path of an image, or 2011_09_26_drive_0013 5")
         camera = int(match["camera"] or (3 if match["side"] == "r" else 2))
         return RawFrame(root, match["drive"], int(match["file"] or match["frame"]), camera)
 
@@ -221,10 +218,7 @@ def _rectified_camera(camera: CalibrationFile, frame: RawFrame, size: tuple[int,
     P_rect = camera.matrix(f"P_rect_0{frame.camera}", (3, 4))
     scale_y, scale_x = size[0] / full_height, size[1] / full_width
     if abs(scale_x / scale_y - 1) > ASPECT_TOLERANCE:
-        raise DataError(
-            f"{frame.image_path()} is {size[1]} x {size[0]}, but the camera in {date} is {full_width:g} x "
-            f"{full_height:g}: the images were cropped or are of another camera"
-        )
+        raise DataError(f"{frame.image_path()} is cropped, or of another camera than that in {date}")
     # half a pixel stays half a pixel when pixels grow: u' = (u - 1/2) s + 1/2, counting from one
     resize = np.array([[scale_x, 0, (1 - scale_x) / 2], [0, scale_y, (1 - scale_y) / 2], [0, 0, 1]])
     rectified: FloatArray = resize @ P_rect

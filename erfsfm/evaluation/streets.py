@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import list_images, read_image, read_values
-from erfsfm.common.readers.kitti_drives import find_drives
+from erfsfm.common.readers.kitti import find_drives
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
 from erfsfm.evaluation.depth_metrics import CAP_M, Crop

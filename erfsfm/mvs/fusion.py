@@ -13,10 +13,10 @@ from onnxruntime import InferenceSession
 
 from erfsfm.common.errors import CheckpointError
 from erfsfm.common.files import read_bytes
-from erfsfm.common.onnx_session import open_session
-from erfsfm.mvs.appearance import Array
+from erfsfm.common.threads import open_session
 from erfsfm.mvs.refine import SIGMA_FLOOR, Measurement, RefinedDepth
 from erfsfm.mvs.sweep import CHANGES, UNIT, Costs, lowest
+from erfsfm.mvs.views import Array
 
 FILE = "fusion.onnx"
 SHIPPED = Path(__file__).parents[1] / "weights" / "fusion"
@@ -54,9 +54,7 @@ class DepthFusion:
             raise CheckpointError(f"{path} is damaged, or no ONNX file: train it again") from error
         inputs = self._session.get_inputs()
         if [i.name for i in inputs] != ["evidence"] or inputs[0].shape[1] != CHANNELS:
-            raise CheckpointError(
-                f"{path} is not a network of erfsfm train-fusion, or of another version: train it again"
-            )
+            raise CheckpointError(f"{path} is no network of this version of erfsfm train-fusion: train it again")
 
     def decide(self, measurement: Measurement) -> RefinedDepth:
         """Between learned and measured depth at each pixel; the network finds by itself what moves."""

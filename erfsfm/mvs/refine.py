@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.mvs.appearance import Appearance, Array
 from erfsfm.mvs.sweep import Costs, is_inside, lowest, smoothed, sweep, warped
-from erfsfm.mvs.views import Projection, halved
+from erfsfm.mvs.views import Appearance, Array, Projection, halved
 
 STEPS = 2
 WINDOW_PX = 5

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.mvs.appearance import Array
-from erfsfm.mvs.views import Projection
+from erfsfm.mvs.views import Array, Projection
 
 # changes of the logarithm of inverse depth, denser near the guess; negative is farther
 CHANGES: Array = np.array([-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32)

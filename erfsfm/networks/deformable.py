@@ -2,14 +2,7 @@
 
 One bilinear sampling reads all taps of all outputs in the order of the kernel's weights, and one
 matrix product combines them. Meaning and argument order are torchvision's.
-
-Where Numba is installed, large layers on a CPU are sampled by `erfsfm.networks.deformable_kernel`
-instead: the same values and gradients up to rounding, in about a third of the time.
 """
-
-import functools
-import logging
-from types import ModuleType
 
 import torch
 import torch.nn.functional as F
@@ -19,11 +12,7 @@ from torch import Tensor, nn
 # paper's largest layer (7 x 7 on 32 channels, 208 x 64, batch 4) take 1.6 s so, 6 s in one piece.
 _CPU_CHUNK = 2**20
 
-# The compiled path reads all channels of a pixel at once: with few channels or few samples it is not faster.
-_KERNEL_CHANNELS = 8
-_KERNEL_SAMPLES = 2**20
-
-logger = logging.getLogger(__name__)
+_LARGE = 2**20  # sampled values of a layer
 
 
 def deform_conv2d(
@@ -63,12 +52,7 @@ def deform_conv2d(
     out_h, out_w = _check_shapes(input, offset, weight, mask, stride, padding, dilation)
     rows = _resting_places(out_h, weight.shape[2], stride[0], padding[0], dilation[0], offset)
     columns = _resting_places(out_w, weight.shape[3], stride[1], padding[1], dilation[1], offset)
-    kernel = _compiled_kernel() if _suits_kernel(input, offset, weight, mask) else None
-    if kernel is None:
-        output = _sample_in_pytorch(input, offset, weight, mask, rows, columns)
-    else:
-        factors = torch.ones_like(offset[:, ::2]) if mask is None else mask
-        output = kernel.deform_conv2d(input, offset, factors, weight, rows, columns)
+    output = _sample(input, offset, weight, mask, rows, columns)
     return output if bias is None else output + bias[:, None, None]
 
 
@@ -109,21 +93,21 @@ class DeformableConv2d(nn.Module):
 
 @torch.inference_mode()
 def has_large_sampling(network: nn.Module, *inputs: Tensor | list[Tensor]) -> bool:
-    """Whether any deformable layer of a network is large enough for the compiled path with these inputs."""
-    met: list[bool] = []
+    """Whether any deformable layer of a network samples so many values that its ONNX graph takes minutes to make."""
+    sampled = [0]
 
-    def look(layer: nn.Module, given: tuple[Tensor, ...]) -> None:
+    def look(layer: nn.Module, _: object, output: Tensor) -> None:
         assert isinstance(layer, DeformableConv2d)
-        met.append(_suits_kernel(given[0], layer.offset(given[0]), layer.kernel.weight, None))
+        sampled.append(output[:, 0].numel() * layer.kernel.weight[0].numel())
 
     layers = [layer for layer in network.modules() if isinstance(layer, DeformableConv2d)]
-    hooks = [layer.register_forward_pre_hook(look) for layer in layers]
+    hooks = [layer.register_forward_hook(look) for layer in layers]
     try:
         network(*inputs)
     finally:
         for hook in hooks:
             hook.remove()
-    return any(met)
+    return max(sampled) > _LARGE
 
 
 def _pair(value: int | tuple[int, int]) -> tuple[int, int]:
@@ -141,15 +125,10 @@ def _check_shapes(
 ) -> tuple[int, int]:
     """Check the shapes and return the size of the output."""
     if input.dim() != 4 or weight.dim() != 4:
-        raise ValueError(
-            f"input and weight must have four dimensions; got {tuple(input.shape)} and {tuple(weight.shape)}"
-        )
+        raise ValueError(f"input and weight must be 4-d; got {tuple(input.shape)} and {tuple(weight.shape)}")
     batch, channels = input.shape[:2]
     if channels % weight.shape[1] or weight.shape[0] % (channels // weight.shape[1]):
-        raise ValueError(
-            f"weight must have shape (C_out, {channels} / groups, k_h, k_w) with groups dividing C_out; "
-            f"got {tuple(weight.shape)}"
-        )
+        raise ValueError(f"weight must have shape (C_out, {channels} / groups, k_h, k_w); got {tuple(weight.shape)}")
     out_h, out_w = (
         (input.shape[2 + i] + 2 * padding[i] - dilation[i] * (weight.shape[2 + i] - 1) - 1) // stride[i] + 1
         for i in range(2)
@@ -192,34 +171,7 @@ def _sampling_grid(offset: Tensor, rows: Tensor, columns: Tensor, size: tuple[in
     return torch.stack((x, y), dim=-1).view(-1, k_h * k_w, out_h * out_w, 2)
 
 
-def _suits_kernel(input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor | None) -> bool:
-    """Whether the compiled path supports the case and is faster; tracing needs plain PyTorch."""
-    if torch.jit.is_tracing() or torch.compiler.is_compiling():  # type: ignore[attr-defined]
-        return False
-    taps = weight.shape[2] * weight.shape[3]
-    if input.shape[1] < _KERNEL_CHANNELS or offset[:, :taps].numel() * input.shape[1] <= _KERNEL_SAMPLES:
-        return False
-    one_group = weight.shape[1] == input.shape[1] and offset.shape[1] == 2 * taps
-    tensors = [input, offset, weight] if mask is None else [input, offset, weight, mask]
-    plain = all(type(tensor) in (Tensor, nn.Parameter) and tensor.device.type == "cpu" for tensor in tensors)
-    dtypes = {tensor.dtype for tensor in tensors}
-    exact = dtypes in ({torch.float32}, {torch.float64}) and not torch.is_autocast_enabled("cpu")
-    return one_group and plain and exact
-
-
-@functools.cache
-def _compiled_kernel() -> ModuleType | None:
-    """The compiled path, or None where Numba cannot be used; logs once which it is."""
-    try:
-        from erfsfm.networks import deformable_kernel
-    except ImportError as error:
-        logger.info("deformable convolution in plain PyTorch (%s); pip install 'erfsfm-slam[fast]' speeds it up", error)
-        return None
-    logger.info("deformable convolution with Numba: compiled on first use (some seconds) and cached")
-    return deformable_kernel
-
-
-def _sample_in_pytorch(
+def _sample(
     input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor | None, rows: Tensor, columns: Tensor
 ) -> Tensor:
     """The convolution without its bias, ``(B, C_out, H_out, W_out)``; arguments as of `deform_conv2d`.

@@ -47,7 +47,34 @@ class DisparityHead(nn.Conv2d):
         return MAX_DISPARITY * torch.sigmoid(super().forward(features)) + MIN_DISPARITY
 
 
-class DepthNet(nn.Module):
+class DisparityNetwork(nn.Module):
+    """An encoder and a decoder with four disparity heads."""
+
+    input_channels = 3  # of the encoder
+    encoder: Encoder
+    fidelity: Fidelity
+
+    def decode(self, image: Tensor, stages: list[Tensor]) -> list[Tensor]:
+        """Disparities, finest first, from the outputs of the encoder's stages; in evaluation mode one suffices."""
+        raise NotImplementedError
+
+    def forward(self, image: Tensor) -> list[Tensor] | Tensor:
+        """Predict disparity, unscaled, in (0.01, 10.01).
+
+        Args:
+            image: colours in [-1, 1], ``(B, 3, H, W)``; any size.
+
+        Returns:
+            In training mode four disparities, finest first, ``(B, 1, ceil(H / 2^s), ceil(W / 2^s))``;
+            in evaluation mode the finest alone, ``(B, 1, H, W)``.
+        """
+        if image.dim() != 4 or image.shape[1] != 3:
+            raise ValueError(f"image must have shape (B, 3, H, W); got {tuple(image.shape)}")
+        disparities = self.decode(image, self.encoder(image))
+        return disparities if self.training else disparities[0]
+
+
+class DepthNet(DisparityNetwork):
     """Encoder-decoder with skip connections and four disparity heads.
 
     Variants change both convolutions of some encoder stages: ``dilated`` conv1-2 (dilation 2), ``dfc``
@@ -56,8 +83,6 @@ class DepthNet(nn.Module):
     default the padding grows; conv1's first layer then still reads every second row and column of the
     image, as stride 2 with dilation 2 does.
     """
-
-    input_channels = 3  # of the encoder
 
     def __init__(
         self,
@@ -96,34 +121,18 @@ class DepthNet(nn.Module):
             for head in self.heads:
                 nn.init.constant_(cast(Tensor, head.bias), FIRST_LOGIT)
 
-    def encoder_layers(self) -> list[Layer]:
-        """Geometry of the encoder's convolutions, first to last."""
-        return self.encoder.layers()
-
     def forward(self, image: Tensor) -> list[Tensor] | Tensor:
-        """Predict disparity, unscaled, in (0.01, 10.01).
-
-        Args:
-            image: colours in [-1, 1], ``(B, 3, H, W)``; any size.
-
-        Returns:
-            In training mode four disparities, finest first, ``(B, 1, ceil(H / 2^s), ceil(W / 2^s))``;
-            in evaluation mode the finest alone, ``(B, 1, H, W)``.
+        """As any disparity network.
 
         Raises:
             ConfigError: for the dilated network in paper fidelity, which fits no image.
         """
         if self.variant == "dilated" and self.fidelity == "paper":
-            raise ConfigError(
-                "erf-depthnet-dilated cannot run in paper fidelity: its maps shrink below what the decoder "
-                "needs at every image size; use fidelity 'default'"
-            )
-        if image.dim() != 4 or image.shape[1] != 3:
-            raise ValueError(f"image must have shape (B, 3, H, W); got {tuple(image.shape)}")
-        disparities = self._decode(image, self.encoder(image))
-        return disparities if self.training else disparities[0]
+            raise ConfigError("erf-depthnet-dilated cannot run in paper fidelity: its maps shrink; use 'default'")
+        return super().forward(image)
 
-    def _decode(self, image: Tensor, stages: list[Tensor]) -> list[Tensor]:
+    def decode(self, image: Tensor, stages: list[Tensor]) -> list[Tensor]:
+        """From the coarsest level to the finest, with the encoder's outputs and the coarser disparity."""
         features = stages[-1]
         disparities: list[Tensor] = []
         references = [*reversed(stages[:-1]), image]

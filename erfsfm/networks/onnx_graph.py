@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession
 
 from erfsfm.common.files import read_bytes, write_atomically
-from erfsfm.common.onnx_session import open_session
+from erfsfm.common.threads import open_session
 
 if TYPE_CHECKING:
     from torch import nn
@@ -36,7 +36,7 @@ class OnnxGraph:
     """A network that is exported at its first call with inputs of each size and run by ONNX Runtime from then on.
 
     Outputs equal the network's up to rounding. A network with large deformable layers stays as it is: its graph takes
-    minutes to make, and the compiled path of `erfsfm.networks.deformable` is faster.
+    minutes to make.
     """
 
     def __init__(self, network: Callable[[], nn.Module], threads: int, identity: str = "") -> None:

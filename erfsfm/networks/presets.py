@@ -2,7 +2,7 @@
 
 import difflib
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 
@@ -26,27 +26,6 @@ class Preset:
     encoder: Literal["paper", "lite0"] = "paper"
 
 
-@dataclass(frozen=True)
-class NetworkSummary:
-    """A network in numbers.
-
-    Attributes:
-        name: preset.
-        kind: what it predicts.
-        parameters: number of weights.
-        multiply_adds: of one forward pass at 416 x 128; None where there is none.
-        multiply_adds_reason: why `multiply_adds` is None, else None.
-        receptive_field: side in pixels at the last encoder layer, at zero offsets.
-    """
-
-    name: str
-    kind: NetworkKind
-    parameters: int
-    multiply_adds: int | None
-    multiply_adds_reason: str | None
-    receptive_field: int
-
-
 PRESETS: dict[str, Preset] = {
     "depthnet": Preset("depth", "plain"),
     "erf-depthnet-dilated": Preset("depth", "dilated"),
@@ -67,7 +46,6 @@ def build(
     width: float = 1.0,
     sources: int = 4,
     normalisation: Normalisation = "none",
-    mask_branch: bool = False,
     activation: Activation = "relu",
     alignment: Alignment = "none",
 ) -> Network:
@@ -80,7 +58,6 @@ def build(
         sources: number of source images of a pose network; a depth network ignores it.
         normalisation: batch norm after every convolution but the heads, or none as published; a pretrained
             encoder has its own, and what follows it has none.
-        mask_branch: explainability masks in a pose network; a depth network ignores it.
         activation: after every convolution but the heads, as published or leaking a tenth.
         alignment: of a pose network's rotations to the images; a depth network ignores it.
 
@@ -102,17 +79,18 @@ def build(
     elif preset.kind == "depth":
         network = DepthNet(preset.variant, fidelity, width, normalisation)
     else:
-        try:
-            network = PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch, alignment)
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
+        network = PoseNet(preset.variant, fidelity, width, sources, normalisation, alignment)
     if activation == "leaky":
         let_leak(network)
     return network
 
 
-def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[NetworkSummary]:
-    """Summaries of all presets of a fidelity; only shapes are computed.
+def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[dict[str, Any]]:
+    """Every preset of a fidelity in numbers; only shapes are computed.
+
+    Returns:
+        Objects of ``name``, ``kind``, ``parameters``, ``multiply_adds`` of one forward pass at 416 x 128 or None with
+        ``multiply_adds_reason``, and ``receptive_field``: side in pixels at the last encoder layer, at zero offsets.
 
     Raises:
         ConfigError: if an option is unknown or out of range.
@@ -123,13 +101,12 @@ def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 
             continue
         with torch.device("meta"):
             network = build(name, fidelity, width, sources)
-        operations, reason = None, None
+        summary = {"name": name, "kind": preset.kind, "parameters": sum(p.numel() for p in network.parameters())}
         try:
-            operations = multiply_adds(network, height=128, width=416)
+            summary |= {"multiply_adds": multiply_adds(network), "multiply_adds_reason": None}
         except ConfigError as error:
-            reason = str(error)
-        parameters = sum(parameter.numel() for parameter in network.parameters())
-        summaries.append(NetworkSummary(name, preset.kind, parameters, operations, reason, theoretical(network)))
+            summary |= {"multiply_adds": None, "multiply_adds_reason": str(error)}
+        summaries.append(summary | {"receptive_field": theoretical(network)})
     return summaries
 
 

@@ -14,11 +14,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from erfsfm.networks.blocks import Encoder, Layer
 from erfsfm.networks.deformable import DeformableConv2d
-from erfsfm.networks.depth_net import DepthNet
-from erfsfm.networks.lite0 import Lite0DepthNet
+from erfsfm.networks.depth_net import DisparityNetwork
 from erfsfm.networks.pose_net import PoseNet
 
-Network = DepthNet | PoseNet | Lite0DepthNet
+Network = DisparityNetwork | PoseNet
 
 # Gradients below this ratio of the largest are rounding of the sampling positions in float64.
 _ROUNDING = 1e-11
@@ -73,7 +72,7 @@ def theoretical(network: Network, offsets_px: float = 0.0) -> int:
         offsets_px: largest outward offset of deformable taps, in pixels of the layer's input; a fraction of a
             pixel reads the next one, too.
     """
-    layers = network.encoder_layers()
+    layers = network.encoder.layers()
     moving = sum(jump for layer, jump in zip(layers, _jumps(layers)) if layer.deformable)
     return field_after(layers) + 2 * math.ceil(offsets_px) * moving
 
@@ -86,7 +85,7 @@ def theoretical_corner(network: Network, pixel: tuple[int, int], offsets_px: flo
         pixel: (row, column) of the observed output in the last encoder layer.
         offsets_px: as for `theoretical`.
     """
-    layers = network.encoder_layers()
+    layers = network.encoder.layers()
     jumps = _jumps(layers)
     reach = 0
     for block, jump in zip(network.encoder.blocks(), jumps):

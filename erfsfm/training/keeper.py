@@ -1,8 +1,10 @@
-"""Weights that a run writes: the latest, the best, and their records."""
+"""Callbacks of a training: the weights that it writes, the latest and the best, and what it says of its steps."""
 
 from __future__ import annotations
 
+import logging
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,9 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 import erfsfm
 from erfsfm.checkpoint import KINDS, Absent, Model, save_model
 from erfsfm.common.errors import TrainingError
+from erfsfm.common.progress import Progress, duration
 from erfsfm.common.readers.frame_range import merge
-from erfsfm.config import TrainedNetworks
+from erfsfm.config import TrainingConfig
 from erfsfm.model_record import ModelRecord, commit, read_record
 from erfsfm.training.module import SelfSupervision, decisive
 
@@ -54,15 +57,15 @@ class WeightKeeper(Callback):
         seen: list[str],
         command: str,
         validates: bool,
-        networks: TrainedNetworks,
-        average: Average | None = None,
+        training: TrainingConfig,
+        device: str = "cpu",
     ) -> None:
         self._output = output
-        self.average = average
+        self.average = Average(training.average_decay, device) if training.average_decay > 0 else None
         self._seen = seen
         self._command = command
         self.validates = validates
-        self._networks = networks
+        self._networks = training.networks
         self._best = dict.fromkeys(self._measures({}), math.inf)
         for folder in self._best:
             if (folder / "model.yaml").is_file():
@@ -173,3 +176,36 @@ def licence_of(seen: list[str]) -> str:
     if any(name.startswith(("kitti", "folder/kitti", "folder/karlsruhe")) for name in seen):
         return "CC BY-NC-SA 3.0 (trained on KITTI)"
     return "unknown: depends on the training data"
+
+
+logger = logging.getLogger(__name__)
+
+_TIMED_STEPS, _TIMED_S = 20, 30.0  # whichever comes first
+
+
+class StepProgress(Callback):
+    """Tells of all steps, also after a resume, and of the loss of the latest; logs what a step takes."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._began: tuple[int, float] | None = None
+        self._said = False
+
+    def on_train_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Tell that the steps begin."""
+        if trainer.is_global_zero:
+            self._progress("steps", trainer.global_step, trainer.max_steps)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any) -> None:
+        """Tell of a step."""
+        assert isinstance(module, SelfSupervision)
+        if not trainer.is_global_zero:
+            return
+        step, steps, now_s = trainer.global_step, trainer.max_steps, time.monotonic()
+        first, began_s = self._began = self._began or (step, now_s)
+        timed = step - first >= min(_TIMED_STEPS, steps - first) or now_s - began_s >= _TIMED_S
+        if timed and step > first and not self._said:
+            self._said = True
+            took_s = (now_s - began_s) / (step - first)
+            logger.info("a step takes %.2g s, all %d steps take %s", took_s, steps, duration(round(steps * took_s)))
+        self._progress(f"steps, loss {module.loss:.4g}", step, steps)

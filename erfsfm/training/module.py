@@ -17,8 +17,7 @@ from erfsfm.config import ExperimentConfig, TrainedNetworks
 from erfsfm.data.samples import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
-from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.geometry.warp import project_into_source, sample
+from erfsfm.geometry.transforms import pose_vector_to_matrix, project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.structure import Bounds
 from erfsfm.model_record import DepthInput

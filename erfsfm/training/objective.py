@@ -10,14 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.geometry.camera import scale_intrinsics
-from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.geometry.warp import Projection, project_into_source, sample
+from erfsfm.geometry.transforms import Projection, pose_vector_to_matrix, project_into_source, sample
 from erfsfm.labels.structure import HEIGHTS
-from erfsfm.losses.photometric import photometric_error
-from erfsfm.losses.regularisation import edge_aware_smoothness, explainability_prior, second_order_smoothness
+from erfsfm.losses.photometric import edge_aware_smoothness, photometric_error, second_order_smoothness
 from erfsfm.losses.structure import (
     Bounds,
     disagreement,
@@ -104,7 +101,6 @@ class _Prediction:
 
     disparities: list[Tensor]
     pose_vectors: Tensor
-    masks: list[Tensor] | None
 
     @staticmethod
     def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
@@ -116,16 +112,11 @@ class _Prediction:
             if not depth_net.training:
                 raise ValueError("the objective needs the depth network in training mode")
             disparities = [disparity.to(precise) for disparity in depth_net(target)]
-        masks: list[Tensor] | None = None
-        if config.network.masks:
-            pose_vectors, masks = pose_net.forward_with_masks(of_snippets, sources)  # type: ignore[operator]
-            masks = [mask.to(precise) for mask in masks]
-            _require_sizes(masks, disparities, config)
-        elif needs_poses(config):
+        if needs_poses(config):
             pose_vectors = pose_net(of_snippets, sources)
         else:
             pose_vectors = target.new_zeros(len(of_snippets), len(sources), 6)
-        return _Prediction(disparities, pose_vectors.to(precise), masks)
+        return _Prediction(disparities, pose_vectors.to(precise))
 
 
 def needs_depth(config: ExperimentConfig) -> bool:
@@ -144,16 +135,6 @@ def needs_poses(config: ExperimentConfig) -> bool:
     return warps or (by_teacher and config.training.networks != "depth")
 
 
-def _require_sizes(masks: list[Tensor], disparities: list[Tensor], config: ExperimentConfig) -> None:
-    for mask, disparity in zip(masks, disparities):
-        if mask.shape[-2:] != disparity.shape[-2:]:
-            raise ConfigError(
-                f"masks of {config.network.pose} in {config.network.fidelity} fidelity have size "
-                f"{tuple(mask.shape[-2:])} where the disparities have {tuple(disparity.shape[-2:])}: "
-                "set network.masks to false or network.fidelity to default"
-            )
-
-
 def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> ObjectiveResult:
     T_source_target = pose_vector_to_matrix(prediction.pose_vectors)
     loss = config.loss
@@ -168,15 +149,11 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
             warped, projection = scale.warp(T_warp)
-            mask = prediction.masks[level] if prediction.masks is not None else None
-            photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
+            photometric = photometric + scale.photometric(warped, projection.valid, loss)
     if config.network.fidelity == "paper":
         photometric = 2 * photometric  # the reference compares images in [-1, 1]
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
-    if prediction.masks is not None and loss.mask_weight > 0:
-        terms["explainability"] = torch.stack([explainability_prior(m) for m in prediction.masks]).sum()
-        total = total + loss.mask_weight * terms["explainability"]
     if batch.bounds is not None:
         teacher_terms = _teacher_terms(prediction, T_source_target, batch.T_source_target, batch.bounds, config)
         terms |= teacher_terms
@@ -238,13 +215,12 @@ class _Level:
         projection = project_into_source(depth, T_source_target.flatten(0, 1), K)
         return sample(self.sources.flatten(0, 1), projection), projection
 
-    def photometric(self, warped: Tensor, valid: Tensor, mask: Tensor | None, loss: LossConfig) -> Tensor:
+    def photometric(self, warped: Tensor, valid: Tensor, loss: LossConfig) -> Tensor:
         count = self.sources.shape[1]
         target = self.target.repeat_interleave(count, dim=0)
         error = photometric_error(target, warped, loss.ssim_weight)  # (B*N, 1, h, w)
         shape = (len(self.target), count, *error.shape[-2:])
         error, valid = error.reshape(shape), valid.reshape(shape)
-        weighed = error if mask is None else error * mask
         still: Tensor | None = None
         if loss.auto_mask:
             with torch.no_grad():
@@ -255,15 +231,15 @@ class _Level:
                 )[:, 0]  # (B, h, w)
         if loss.reduction == "mean":
             # pixels without a source count as zero and sources are summed, as in the paper's code
-            summed = (weighed * valid).sum(dim=1)
+            summed = (error * valid).sum(dim=1)
             if still is None:
                 return summed.mean()
-            moving = ((error * valid).sum(1) / valid.sum(1).clamp(min=1) < still) & valid.any(dim=1)
+            moving = (summed / valid.sum(1).clamp(min=1) < still) & valid.any(dim=1)
             return (summed * moving).mean()
-        best = weighed.masked_fill(~valid, torch.inf).amin(dim=1)  # (B, h, w)
+        best = error.masked_fill(~valid, torch.inf).amin(dim=1)  # (B, h, w)
         counted = valid.any(dim=1)
         if still is not None:
-            counted = counted & (error.detach().masked_fill(~valid, torch.inf).amin(dim=1) < still)
+            counted = counted & (best.detach() < still)
         return best.masked_fill(~counted, 0).sum() / counted.sum().clamp(min=1)
 
     def smoothness(self, loss: LossConfig) -> Tensor:

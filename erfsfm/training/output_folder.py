@@ -26,7 +26,7 @@ class OutputFolder:
         """Accept a folder that is new, empty, or of a run that failed before its first checkpoint.
 
         Raises:
-            TrainingError: a run with weights, or files that no training wrote; one line.
+            TrainingError, ConfigError: a run with weights, or files that no training wrote; one line.
         """
         if not self.path.exists():
             return
@@ -36,13 +36,13 @@ class OutputFolder:
             raise TrainingError(f"{self.path} holds a run already: continue with --resume or choose another --output")
         names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name} - {MEASUREMENTS}
         foreign = sorted(names - _BEGUN)
-        if not foreign and names and not self._has_our_config():
-            foreign = [CONFIG if CONFIG in names else min(names)]
         if foreign:
             raise TrainingError(
                 f"{self.path} holds files that 'erfsfm train' did not write ({foreign[0]}): choose a new or empty "
                 "--output; nothing was changed"
             )
+        if (self.path / CONFIG).is_file():
+            load_experiment(self.path / CONFIG)  # of another program it would be replaced
 
     def resumable_steps(self, config: ExperimentConfig) -> int:
         """Steps done at the last checkpoint.
@@ -54,9 +54,7 @@ class OutputFolder:
         written = self.path / CONFIG
         for needed in (self.checkpoint, written):
             if not needed.is_file():
-                raise TrainingError(
-                    f"nothing to resume in {self.path}: no {needed.relative_to(self.path)}; start without --resume"
-                )
+                raise TrainingError(f"nothing to resume in {self.path}: no {needed.name}; start without --resume")
         steps = _steps_of(self.checkpoint)
         begun = load_experiment(written)
         if begun.network != config.network:
@@ -64,22 +62,12 @@ class OutputFolder:
         for key in ("networks", "frozen_stages"):
             before, now = getattr(begun.training, key), getattr(config.training, key)
             if before != now:
-                raise ConfigError(
-                    f"{written} began with training.{key} {before}; got {now}, which cannot take over the optimiser's "
-                    "state: resume with the same, or start again from its weights"
-                )
+                raise ConfigError(f"{written} began with training.{key} {before}; got {now}: resume with the same")
         return steps
 
     def write_config(self, config: ExperimentConfig) -> None:
         """Write the complete configuration of the run."""
         write_atomically(self.path / CONFIG, lambda path: path.write_text(dump_yaml(config)))
-
-    def _has_our_config(self) -> bool:
-        """Whether ``config.yaml`` is what `write_config` writes: all keys, in its order."""
-        try:
-            return dump_yaml(load_experiment(self.path / CONFIG)) == (self.path / CONFIG).read_text()
-        except ConfigError:
-            return False
 
 
 def _steps_of(checkpoint: Path) -> int:
@@ -95,6 +83,4 @@ def _steps_of(checkpoint: Path) -> int:
     except MemoryError:
         raise
     except Exception as error:  # a damaged file makes PyTorch raise anything, failed assertions too
-        raise TrainingError(
-            f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start again in another --output"
-        ) from error
+        raise TrainingError(f"{checkpoint} is damaged or no checkpoint: start again in another --output") from error

@@ -25,24 +25,23 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import KINDS, load_model, take_over
-from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.errors import ConfigError
 from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import opencv_threads
-from erfsfm.config import ExperimentConfig, Precision, TrainingConfig
+from erfsfm.config import ExperimentConfig, Precision
 from erfsfm.data.exact_depth import by_label, stacked
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
-from erfsfm.training.keeper import Average, WeightKeeper
+from erfsfm.training.keeper import StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
-from erfsfm.training.progress import StepProgress
 from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
@@ -58,9 +57,7 @@ def train(
     command: str = "",
     progress: Progress = silent,
 ) -> Path:
-    """Train, validate, keep the best.
-
-    With several devices Lightning starts the program again for each further one; these exit here.
+    """Train, validate, keep the best; with several devices Lightning starts further processes, which exit here.
 
     Args:
         config: the experiment.
@@ -78,7 +75,10 @@ def train(
     Raises:
         ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
     """
-    _require_devices(config.training.devices, device)
+    on_cpu = choose_device(device) == "cpu"
+    there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
+    if (devices := config.training.devices) > there:
+        raise ConfigError(f"training.devices is {devices} on a machine with {there}: set {there} or fewer")
     folder = OutputFolder(output)
     rank = LightningEnvironment().local_rank()
     done_steps = folder.resumable_steps(config) if resume else 0
@@ -88,16 +88,17 @@ def train(
     if config.data.validation and not validation and rank == 0:
         logger.warning("training runs without validation: no recording of data.validation is among the data")
     lightning.seed_everything(config.training.seed, verbose=False)
-    timer = _timer(config.training.minutes)
+    minutes = config.training.minutes
+    timer = Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)  # keeps its time in checkpoints
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(training, config, (done_steps, rank), output, progress)
+    draws = _draws(config, training, (done_steps, rank), output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
-    keeper = _keeper(config.training, output, seen, command, bool(validation), device)
+    keeper = WeightKeeper(output, seen, command, bool(validation), config.training, choose_device(device))
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
-    loader = _loader(draws, config, device)
+    loader = _loader(draws, config, pin_memory=not on_cpu)
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     with raising_on_termination(), FolderLock() as lock:
         if rank == 0:
@@ -121,9 +122,7 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ConfigError(f"--prepare {output} is not empty: choose a new folder; nothing was changed")
     if config.data.validation_share > 0:  # it would be taken off again
-        raise ConfigError(
-            "--prepare keeps whole recordings to validate on: set data.validation, and data.validation_share=0"
-        )
+        raise ConfigError("--prepare keeps whole recordings to validate on: set data.validation_share=0")
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
     _, measured = by_label(training, config)
@@ -156,53 +155,25 @@ def depth_before_and_after(
     return rows
 
 
-def _require_devices(wanted: int, device: str) -> None:
-    on_cpu = choose_device(device) == "cpu"
-    there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
-    if wanted > there:
-        raise ConfigError(
-            f"training.devices is {wanted} on a machine with {there} {'cores' if on_cpu else 'GPUs'}: "
-            f"set training.devices={there} or fewer"
-        )
-
-
-def _timer(minutes: float) -> Timer:
-    """Time of the loop, kept in checkpoints; it ends the run after some minutes, if any are given."""
-    return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
-
-
-def _keeper(
-    training: TrainingConfig, output: Path, seen: list[str], command: str, validates: bool, device: str
-) -> WeightKeeper:
-    decay = training.average_decay
-    average = Average(decay, choose_device(device)) if decay > 0 else None
-    return WeightKeeper(output, seen, command, validates, training.networks, average)
-
-
 def _draws(
-    training: list[Recording],
-    config: ExperimentConfig,
-    position: tuple[int, int],
-    output: Path,
-    progress: Progress,
+    config: ExperimentConfig, training: list[Recording], position: tuple[int, int], output: Path, progress: Progress
 ) -> SnippetDraws:
     """What this process trains on; ``position``: steps done and rank."""
     done_steps, rank = position
     together = config.training.batch * config.training.devices
-    draws, done = config.training.steps * together, done_steps * together
     _, measured = by_label(training, config)
-    folder = config.teacher.cache or output / MEASUREMENTS
-    many_views = measured_views(measured, config, folder, progress)
-    return SnippetDraws(training, config, draws, done, rank, many_views, imitated(config))
+    views = measured_views(measured, config, config.teacher.cache or output / MEASUREMENTS, progress)
+    last, done = config.training.steps * together, done_steps * together
+    return SnippetDraws(training, config, last, done, rank, views, imitated(config))
 
 
-def _loader(draws: SnippetDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
+def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> DataLoader[dict[str, Tensor]]:
     workers = config.data.workers
     return DataLoader(
         draws,
         config.training.batch,
         num_workers=workers,
-        pin_memory=choose_device(device) == "cuda",
+        pin_memory=pin_memory,
         worker_init_fn=_single_threaded_worker,
         collate_fn=stacked,
         persistent_workers=workers > 0,
@@ -231,9 +202,6 @@ def _fit(
             warnings.filterwarnings("ignore", message=".*dirpath has changed.*")
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint if resume else None, weights_only=True)
-    except DataError as error:
-        # an error of a worker process has its traceback before the message, its last line
-        raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.common.errors.DataError: ")) from error
     except SystemExit as error:
         number = error.number if isinstance(error, Terminated) else signal.SIGINT  # Lightning turns ctrl-C into an exit
         next_time = "continue with --resume" if checkpoint.is_file() else "start again, for it has no checkpoint yet"
@@ -263,9 +231,7 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
             trained = model.depth_net if kind == "depth" else model.pose_net
             take_over(module.network(kind), trained.state_dict())
     except ConfigError as error:
-        raise ConfigError(
-            f"initial_weights '{name}' are of another network, {model.record.network.model_dump()}: {error}"
-        ) from error
+        raise ConfigError(f"initial_weights '{name}' are of another network: {error}") from error
     if model.record.networks != module.known:
         module.known = "both"
     if (model.record.network.depth, model.record.network.depth_width) == (wanted.depth, wanted.depth_width):
@@ -283,12 +249,6 @@ def _trainer(
     training = config.training
     on_cpu = choose_device(device) == "cpu"
     precision = _precision_on_cpu(training.precision) if on_cpu else training.precision
-    if on_cpu and precision == "bf16-mixed" and max(config.network.height, config.network.width) <= 64:
-        # PyTorch 2.13 leaves gradients of its bfloat16 convolutions uninitialised where the feature map is one pixel
-        raise ConfigError(
-            f"training.precision {training.precision} on a CPU needs images of more than 64 pixels in one direction; "
-            f"got {config.network.height}x{config.network.width}: set training.precision=32-true"
-        )
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     latest = ModelCheckpoint(
         output / "checkpoints",

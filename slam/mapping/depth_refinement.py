@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from erfsfm.mvs.appearance import Appearance
 from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide, RefinedDepth, measure
-from erfsfm.mvs.views import neighbours_around
+from erfsfm.mvs.views import Appearance, neighbours_around
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert

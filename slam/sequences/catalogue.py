@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.kitti_drives import drive_name, find_odometry_root
+from erfsfm.common.readers.kitti import drive_name, find_odometry_root
 from erfsfm.common.readers.video import VIDEO_SUFFIXES
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.runtime.imports import import_plug_in, plug_ins

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
-from erfsfm.common.yaml_file import parse_yaml
 
 Keys = dict[str, Any]
 

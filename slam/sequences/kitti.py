@@ -17,11 +17,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
-from erfsfm.common.readers import kitti_calibration, kitti_drives, kitti_sensors
+from erfsfm.common.readers import kitti
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import has_images, list_images
-from erfsfm.common.readers.kitti_calibration import CalibrationFile
-from erfsfm.common.readers.kitti_drives import OdometryRoot
+from erfsfm.common.readers.kitti import CalibrationFile, OdometryRoot
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
 from erfsfm.common.readers.pinhole import Pinhole
 from slam.formats.ply import read_ply
@@ -54,14 +53,14 @@ _RATES = slice(17, 20)  # of the angles, in a packet
 def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> RecordedSequence:
     """One sequence of an odometry root; a camera that was ``asked`` for replaces its calibration and camera height."""
     folder = root.sequences / name
-    number = kitti_drives.odometry_camera(folder)
+    number = kitti.odometry_camera(folder)
     if number is None:
-        looked = ", ".join(f"image_{camera}" for camera in kitti_drives.ODOMETRY_CAMERAS)
+        looked = ", ".join(f"image_{camera}" for camera in kitti.ODOMETRY_CAMERAS)
         raise SequenceError(f"no images in {folder}: looked for png or jpg in {looked}")
     stored = ImageFiles(by_number(list_images(folder / f"image_{number}")))
     files, times = stored.files, folder / "times.txt"
     stamps = read_stamps(times, files) if times.exists() else _even(times, files)
-    calibration = CalibrationFile(folder / kitti_calibration.ODOMETRY_CALIBRATION)
+    calibration = CalibrationFile(folder / kitti.ODOMETRY_CALIBRATION)
     T_camera_cam0 = calibration.T_camera_cam0(f"P{number}")
     simulated = root.simulation_seed()
     key = next((key for key in ("Tr", "Tr_velo_to_cam") if key in calibration), None)
@@ -73,7 +72,7 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
         stamps=stamps,
         sources=(Source(root.recording_name(name), first=files.first if simulated is None else None),),
         T_any_camera=_odometry_poses(root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0),
-        usual_height_m=kitti_calibration.CAMERA_HEIGHT_M if simulated is None or asked is not None else None,
+        usual_height_m=kitti.CAMERA_HEIGHT_M if simulated is None or asked is not None else None,
         T_camera_lidar=None if T_cam0_lidar is None else T_camera_cam0 @ T_cam0_lidar,
         scans=_scans(folder / "velodyne", files),
         depth_maps=_depth_maps(folder / f"depth_{number}", files),
@@ -84,17 +83,17 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
 def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
     """One synced and rectified drive; its calibration is scaled to the images' true size."""
     drive = drive.absolute()
-    number = next((c for c in kitti_drives.RAW_CAMERAS if has_images(drive / f"image_{c}" / "data")), None)
+    number = next((c for c in kitti.RAW_CAMERAS if has_images(drive / f"image_{c}" / "data")), None)
     if number is None:
-        looked = ", ".join(f"image_{c}/data" for c in kitti_drives.RAW_CAMERAS)
+        looked = ", ".join(f"image_{c}/data" for c in kitti.RAW_CAMERAS)
         raise SequenceError(f"no images in {drive}: looked for png or jpg in {looked}; copy the drive again")
     stored = ImageFiles(by_number(list_images(drive / f"image_{number}" / "data")))
     files, times = stored.files, drive / f"image_{number}" / "timestamps.txt"
-    cameras = CalibrationFile(drive.parent / kitti_calibration.CAM_TO_CAM)
+    cameras = CalibrationFile(drive.parent / kitti.CAM_TO_CAM)
     known = _dates(times, files)
     stamps = _even(times, files) if known is None else known - known[0]
     T_camera_lidar = _T_camera_lidar(drive, cameras, number)
-    name = kitti_drives.drive_name(drive.name)
+    name = kitti.drive_name(drive.name)
     places = drive, drive.parent, drive.parent.parent
     return RecordedSequence(
         name=name,
@@ -103,7 +102,7 @@ def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
         stamps=stamps,
         sources=tuple(source.shifted(files.first) for source in drive_sources(name)),
         T_any_camera=_oxts_poses(drive, files, stamps, known, T_camera_lidar),
-        usual_height_m=kitti_calibration.CAMERA_HEIGHT_M,
+        usual_height_m=kitti.CAMERA_HEIGHT_M,
         T_camera_lidar=T_camera_lidar,
         scans=_scans(drive / "velodyne_points/data", files),
         depth_maps=_depth_maps(drive / _DEPTH_MAPS / f"image_{number}", files),
@@ -113,11 +112,7 @@ def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
 def drive_sources(name: str) -> tuple[Source, ...]:
     """A raw drive's names in the leak record: its own, and that of the odometry sequence made from it."""
     own = Source(f"kitti_raw/{name}")
-    cut = (
-        (sequence, first, stop)
-        for sequence, (drive, first, stop) in kitti_drives.ODOMETRY_DRIVES.items()
-        if drive == name
-    )
+    cut = ((sequence, first, stop) for sequence, (drive, first, stop) in kitti.ODOMETRY_DRIVES.items() if drive == name)
     return own, *(Source(f"kitti_odometry/{s}", first=-first, length=stop - first) for s, first, stop in cut)
 
 
@@ -172,7 +167,7 @@ def _odometry_poses(
 
 def _T_camera_lidar(drive: Path, cameras: CalibrationFile, number: str) -> FloatArray | None:
     """LiDAR to the rectified camera; None where ``calib_velo_to_cam.txt`` is missing."""
-    path = drive.parent / kitti_calibration.VELO_TO_CAM
+    path = drive.parent / kitti.VELO_TO_CAM
     if not path.exists():
         logger.warning("no %s: neither LiDAR nor GPS/INS has extrinsics to the camera", path)
         return None
@@ -190,7 +185,7 @@ def _oxts_poses(
     T_camera_lidar: FloatArray | None,
 ) -> FloatArray | None:
     """``T_world_camera`` from the GPS/INS; None where it or its calibration is missing."""
-    folder, path = drive / "oxts" / "data", drive.parent / kitti_calibration.IMU_TO_VELO
+    folder, path = drive / "oxts" / "data", drive.parent / kitti.IMU_TO_VELO
     if T_camera_lidar is None or not folder.is_dir():
         return None
     if not path.exists():
@@ -210,7 +205,7 @@ def _oxts_poses(
     packet_times = _dates(drive / "oxts" / "timestamps.txt", packets)
     if image_times is not None and packet_times is not None:
         ages_s = image_times[known] - packet_times[known + files.first - packets.first]
-    content = np.array([kitti_sensors.read_packet(paths[files.first + row]) for row in rows])
+    content = np.array([kitti.read_packet(paths[files.first + row]) for row in rows])
     T_camera_imu = T_camera_lidar @ CalibrationFile(path).transform("R", "T")
     T_world_camera = T_world_imu(content, ages_s) @ se3.invert(T_camera_imu)
     if len(known) < len(files):
@@ -233,7 +228,7 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
     scale = np.cos(latitude[0])
     east = scale * _EARTH_RADIUS_M * longitude
     north = scale * _EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + latitude / 2))
-    velocity = packets[:, [kitti_sensors.VELOCITY_EAST, kitti_sensors.VELOCITY_NORTH, kitti_sensors.VELOCITY_UP]]
+    velocity = packets[:, [kitti.VELOCITY_EAST, kitti.VELOCITY_NORTH, kitti.VELOCITY_UP]]
     positions = np.column_stack([east, north, altitude]) + velocity * ages_s[:, None]
     turn = Rotation.from_rotvec(packets[:, _RATES] * ages_s[:, None])
     R_world_imu = Rotation.from_euler("ZYX", packets[:, [5, 4, 3]]) * turn
@@ -242,7 +237,7 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
 
 def _scans(folder: Path, files: NumberedFiles) -> dict[int, ScanReader]:
     """The LiDAR scans of a folder by frame."""
-    return {row: partial(kitti_sensors.read_velodyne, path) for row, path in _by_row(folder, "*.bin", files).items()}
+    return {row: partial(kitti.read_velodyne, path) for row, path in _by_row(folder, "*.bin", files).items()}
 
 
 def _depth_maps(folder: Path, files: NumberedFiles) -> DepthMaps | None:
@@ -275,21 +270,21 @@ def _distance_to_mesh(path: Path) -> Callable[[FloatArray], FloatArray] | None:
 
 def _find_odometry(path: Path, asked: Asked) -> dict[str, Opener]:
     """The sequences of a root, or the one whose own folder is given."""
-    root = kitti_drives.find_odometry_root(path)
+    root = kitti.find_odometry_root(path)
     if root is not None:
         names = root.names()
         if asked.name is not None and asked.name not in names and (root.sequences / asked.name).is_dir():
             names.append(asked.name)  # for the error about what it lacks
         return {name: partial(_open_odometry, root, name, asked.camera) for name in names}
     where = path.absolute()
-    above = kitti_drives.find_odometry_root(where.parent) if where.parent.name == "sequences" else None
-    if above is None or kitti_drives.odometry_camera(path) is None:
+    above = kitti.find_odometry_root(where.parent) if where.parent.name == "sequences" else None
+    if above is None or kitti.odometry_camera(path) is None:
         return {}
     return {where.name: partial(_open_odometry, above, where.name, asked.camera)}
 
 
 def _find_raw(path: Path, asked: Asked) -> dict[str, Opener]:
-    return {name: partial(_open_raw, drive, asked.camera) for name, drive in kitti_drives.find_drives(path).items()}
+    return {name: partial(_open_raw, drive, asked.camera) for name, drive in kitti.find_drives(path).items()}
 
 
 LOADERS = (

@@ -21,7 +21,7 @@ from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import has_images, list_images
-from erfsfm.common.readers.kitti_sensors import read_velodyne
+from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
 from slam.formats.rows import BadRows, in_seconds, number_or_nan, text_of
 from slam.formats.trajectory import nearest_stamps, read_trajectory

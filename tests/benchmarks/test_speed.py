@@ -3,13 +3,11 @@
 Nothing here asserts a time; machines are shared and differ.
 """
 
-import importlib.util
 from collections.abc import Callable
 
 import pytest
 import torch
 
-from erfsfm.networks import deformable
 from erfsfm.networks.presets import build
 
 pytestmark = pytest.mark.slow
@@ -28,28 +26,21 @@ PAIRS = (
 Clock = Callable[..., list[float]]
 
 
-def test_networks_forward_and_backward(cpu_ms: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_networks_forward_and_backward(cpu_ms: Clock) -> None:
     image, sources = torch.rand(SIZE) * 2 - 1, [torch.rand(SIZE) * 2 - 1 for _ in range(4)]
-    compiled_kernel = deformable._compiled_kernel
-
     networks = {name: build(name) for pair in PAIRS for name in pair}
 
-    def step(depth: str, pose: str, compiled: bool) -> Callable[[], None]:
+    def step(depth: str, pose: str) -> Callable[[], None]:
         def work() -> None:
-            monkeypatch.setattr(deformable, "_compiled_kernel", compiled_kernel if compiled else lambda: None)
             loss = sum(d.mean() for d in networks[depth](image)) + networks[pose](image, sources).mean()
             loss.backward()
 
         return work
 
-    rows = [(*pair, path) for pair in PAIRS for path in ("Numba", "PyTorch") if path == "PyTorch" or "dfc" in str(pair)]
-    if importlib.util.find_spec("numba") is None:
-        rows = [row for row in rows if row[2] == "PyTorch"]
-    costs = cpu_ms(*(step(depth, pose, path == "Numba") for depth, pose, path in rows))
-    print("\n\n| depth network | pose network | deformable in | CPU ms | ratio |\n|---|---|---|---:|---:|")
-    for (depth, pose, path), cost in zip(rows, costs):
-        path = path if "dfc" in depth + pose else ""
-        print(f"| {depth} | {pose} | {path} | {cost:.0f} | {cost / costs[0]:.2f} |")
+    costs = cpu_ms(*(step(*pair) for pair in PAIRS))
+    print("\n\n| depth network | pose network | CPU ms | ratio |\n|---|---|---:|---:|")
+    for (depth, pose), cost in zip(PAIRS, costs):
+        print(f"| {depth} | {pose} | {cost:.0f} | {cost / costs[0]:.2f} |")
 
 
 def test_simulated_street(cpu_ms: Clock) -> None:

@@ -99,8 +99,7 @@ def test_weights_that_are_not_finite(
 
 
 FOREIGN = {
-    "a configuration": {"config.yaml": "model: {layers: 3}\n"},
-    "logs of another tool": {"logs/a.csv": "1,2"},
+    "a note": {"notes.txt": "mine"},
     "our configuration and a note": {"config.yaml": dump_yaml(load_experiment("tiny")), "notes.txt": "mine"},
 }
 

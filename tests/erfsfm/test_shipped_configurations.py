@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ import yaml
 
 from erfsfm.checkpoint import load_model
 from erfsfm.cli import main
-from erfsfm.config import load_experiment
+from erfsfm.common.errors import ConfigError
+from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.model_record import SHIPPED
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
@@ -74,3 +76,73 @@ def test_it_starts(
     record = load_model(output).record
     assert record.step == 1
     assert record.network == config.network
+
+
+FILES = sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("table*.yaml"))
+
+
+def test_the_guide_names_them_all() -> None:
+    guide = (FILES[0].parents[2] / "docs" / "design" / "reproduction.md").read_text()
+    assert set(re.findall(r"^\| `(table[123]-.+?)`", guide, re.MULTILINE)) == {path.stem for path in FILES}
+
+
+def test_the_beginning_of_a_name_lists_all_that_begin_so() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_experiment("table1")
+    assert all((path.stem in str(caught.value)) == path.stem.startswith("table1") for path in FILES)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_file_has_the_experiment_of_its_name(path: Path) -> None:
+    experiment = load_experiment(path)
+    network = experiment.network
+    networks, size = re.fullmatch(r"table[123]-(.*?)-(\d+x\d+)", path.stem).groups()  # type: ignore[union-attr]
+    assert f"{network.width}x{network.height}" == size
+    presets = networks if "depthnet" in networks else f"depthnet-{networks}"
+    presets = presets if "posenet" in presets else f"{presets}-posenet"
+    assert f"{network.depth}-{network.pose}" == presets
+    assert (network.fidelity, network.sources, network.normalisation) == ("paper", 4, "none")
+    assert (network.depth_width, network.pose_width) == (1.0, 1.0)
+    loss, training, data = experiment.loss, experiment.training, experiment.data
+    assert (loss.smoothness, loss.smoothness_weight) == ("depth-second-order", 0.2)
+    assert (loss.ssim_weight, loss.reduction, loss.auto_mask) == (0, "mean", False)
+    assert (training.batch, training.learning_rate, training.schedule, training.steps) == (4, 2e-4, "constant", 200_000)
+    assert (data.flip, data.zoom, data.colour_jitter) == (0.5, 1.15, 0)
+    assert {"kitti_odometry/09", "kitti_odometry/10"} == set(data.exclude)
+
+
+SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "experiment.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_configurations_load_by_name_and_by_path(path: Path) -> None:
+    assert load_experiment(path.stem) == load_experiment(path)
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_round_trip(path: Path, tmp_path: Path) -> None:
+    config = load_experiment(path, ["data.roots=[/a/b, c]", "initial_weights=sim"])
+    assert load_experiment(write(tmp_path, dump_yaml(config))) == config
+
+
+def test_defaults_are_the_papers() -> None:
+    config = load_experiment(None)
+    assert config == ExperimentConfig()
+    assert config.network.sources == 4
+    assert (config.network.height, config.network.width) == (128, 416)
+    assert config.loss.smoothness_weight == 0.2
+    assert config.loss.ssim_weight == 0
+    assert config.training.learning_rate == 2e-4
+    assert load_experiment(None).network.normalisation == "none"
+
+
+def test_overrides() -> None:
+    config = load_experiment("tiny", ["training.steps=7", "data.validation=[]", "loss.auto_mask=false"])
+    assert (config.training.steps, config.data.validation, config.loss.auto_mask) == (7, [], False)
+    assert config.network == load_experiment("tiny").network

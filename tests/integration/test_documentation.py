@@ -85,7 +85,6 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"truncation_voxels=12|make_figures.py ", "it wants frame 80 of KITTI's drive 0013"),
     (r"tools/reproduce.py ", "it trains the paper's networks"),
     (r"benchmark.py full-size ", "it wants images at the size of KITTI's cameras, and half an hour"),
-    (r"compare.py ", "it wants ORB-SLAM3 in an environment of its own"),
     (r"benchmark.py handheld ", "it wants data sets, or minutes a room"),
     (r"benchmark.py speed ", "it wants another checkout; tests/tools/test_benchmark.py has the parts"),
     (

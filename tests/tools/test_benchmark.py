@@ -24,8 +24,8 @@ from slam.runtime.attempt import Failed
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
-page, pairs, plan, work = (
-    importlib.import_module(f"benchmarking.{name}") for name in ("page", "pairs", "plan", "work")
+columns, page, plan, work = (
+    importlib.import_module(f"benchmarking.{name}") for name in ("metrics", "page", "plan", "work")
 )
 
 
@@ -83,17 +83,15 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any)
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
 
 
-def test_errors_relative_to_path_and_network(tmp_path: Path) -> None:
-    (tmp_path / "metrics.json").write_text("{}")
+def test_errors_relative_to_path_and_network(job: Any) -> None:
     run = metrics(ate=0.9)
     slower = metrics(ate=3.6).trajectories.network
     run = run.changed(trajectories=run.trajectories.model_copy(update={"network": slower}))
-    derived = work.derive_metrics(tmp_path, run)
-    shares = derived.network_percent, derived.optimised_percent, derived.of_network
-    assert shares == pytest.approx((4.0, 1.0, 0.25))
-    assert derived.false_loops is None
+    definitions = columns.NETWORK_PERCENT, columns.PERCENT, columns.OF_NETWORK
+    shares = [each.value(work.JobResult(job, run, "abc")) for each in definitions]
+    assert shares == pytest.approx([4.0, 1.0, 0.25])
     run = run.changed(sequence=SequenceMetrics.of(length_m=Failed("no truth")))
-    assert work.derive_metrics(tmp_path, run).optimised_percent is None
+    assert columns.PERCENT.value(work.JobResult(job, run, "abc")) is None
 
 
 @pytest.mark.parametrize(
@@ -105,20 +103,14 @@ def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float,
     T_world_camera[2, :3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     off = from_rotation_vector(np.deg2rad([0.0, turned_deg, 0.0]), np.array([moved_m, 0.0, 0.0]))
     loops = [{"from": 1, "to": 2, "T_from_to": (invert(T_world_camera[1]) @ T_world_camera[2] @ off).tolist()}]
-    (tmp_path / "metrics.json").write_text("{}")
+    RunFolder(tmp_path).write_metrics(metrics())
     (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
-    derived = work.derive_metrics(tmp_path, metrics())
-    assert (derived.true_loops, derived.false_loops) == (1 - false, false)
+    assert work.loops(tmp_path) == (1 - false, false)
+    work.loops.cache_clear()
     in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
-    assert work.derive_metrics(tmp_path, in_heights).true_loops is None
-
-
-def test_ablation_compares_with_the_same_seed(job: Any) -> None:
-    results = results_of(job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
-    table = cells(page.ablation_tables(results))
-    assert [row[:2] for row in table[1:3]] == [["everything on", "1.00 (1.00)"], ["no loops", "2.00 (4.00)"]]
-    assert table[-2:] == [["everything on", "1.50"], ["no loops", "3.00"]]
+    RunFolder(tmp_path).write_metrics(in_heights)
+    assert work.loops(tmp_path) == (None, None)
 
 
 def test_a_number_that_is_missing_is_named_below(job: Any) -> None:
@@ -134,10 +126,8 @@ def test_two_checkouts_in_turn(tmp_path: Path) -> None:
     text = report.read_text()
     table = cells(text)
     head, row = table[0], table[1]
-    cpu, busiest = (head.index(name) for name in ("CPU ms / frame", "CPU ms / frame of the busiest thread"))
-    before, after = (float(part.split(":")[0]) for part in row[cpu].split(","))
+    before, after = (float(part.split(":")[0]) for part in row[head.index("CPU ms / frame")].split(","))
     assert row[0] == "grid 610, 12 frames" and before > 0 and after > 0
-    assert float(row[busiest].split(",")[0]) > 0
     assert "geometry" in table[2] and str(tmp_path) not in text
 
 

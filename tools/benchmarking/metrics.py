@@ -9,7 +9,7 @@ from statistics import fmean, median, stdev
 from typing import Any
 
 from benchmarking.plan import slug
-from benchmarking.work import JobResult, ratio
+from benchmarking.work import JobResult, loops, ratio
 
 from erfsfm.common.table import DASH, Table
 
@@ -38,6 +38,10 @@ def _error(trajectory: str, alignment: str) -> MetricDefinition:
     return MetricDefinition(f"ate_{alignment}dof_{trajectory}_m", title, value, 2)
 
 
+def _share(key: str, title: str, part: MetricDefinition, whole: MetricDefinition, unit: float) -> MetricDefinition:
+    return MetricDefinition(key, title, lambda o: ratio(part.value(o), whole.value(o), unit), 2)
+
+
 def stage_seconds(o: JobResult, stage: str) -> float | None:
     """Seconds of a stage of a run."""
     return (o.metrics.timing.stages or {}).get(stage)
@@ -52,17 +56,13 @@ _R_REL, _SCALE = (
 )
 R_REL = MetricDefinition("r_rel_deg_per_100m", "r_rel (deg / 100 m)", _R_REL, 2)
 SCALE = MetricDefinition("scale", "scale", _SCALE, 3)
-PERCENT = MetricDefinition("ate_7dof_optimised_percent", "7-dof, % of path", lambda o: o.derived.optimised_percent, 2)
-PERCENT_6 = MetricDefinition(
-    "ate_6dof_optimised_percent", "6-dof, % of path", lambda o: ratio(ATE_6.value(o), LENGTH.value(o), 100.0), 2
-)
-NETWORK_PERCENT = MetricDefinition(
-    "ate_7dof_network_percent", "network, % of path", lambda o: o.derived.network_percent, 2
-)
-OF_NETWORK = MetricDefinition("ate_7dof_of_network", "of network's", lambda o: o.derived.of_network, 2)
+PERCENT = _share("ate_7dof_optimised_percent", "7-dof, % of path", ATE_7, LENGTH, 100.0)
+PERCENT_6 = _share("ate_6dof_optimised_percent", "6-dof, % of path", ATE_6, LENGTH, 100.0)
+NETWORK_PERCENT = _share("ate_7dof_network_percent", "network, % of path", ERRORS[0], LENGTH, 100.0)
+OF_NETWORK = _share("ate_7dof_of_network", "of network's", ATE_7, ERRORS[0], 1.0)
 LOOPS = MetricDefinition("loops_accepted", "loops closed", lambda o: o.metrics.loops.accepted, 0)
-TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: o.derived.true_loops, 0)
-FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: o.derived.false_loops, 0)
+TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: loops(o.job.place / "run")[0], 0)
+FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: loops(o.job.place / "run")[1], 0)
 COVERAGE = MetricDefinition("coverage_95", "coverage of 95 %", lambda o: o.metrics.graph.coverage.inside_95, 2)
 TRIANGLES = MetricDefinition("map_triangles", "map triangles", lambda o: o.metrics.map.triangles, 0)
 MAP_ERRORS = (
@@ -83,15 +83,22 @@ MAP_SIZES = (
     MetricDefinition("map_frames_fused", "frames fused", lambda o: o.metrics.map.frames_fused, 0),
     MetricDefinition("map_floater_share", "floaters", lambda o: o.metrics.map.floater_share, 3),
 )
-FUSION = MetricDefinition("fusion_ms_per_keyframe", "fusion (ms / keyframe)", lambda o: o.derived.fusion_ms, 1)
+FUSION = MetricDefinition(
+    "fusion_ms_per_keyframe",
+    "fusion (ms / keyframe)",
+    lambda o: ratio(stage_seconds(o, "map"), o.metrics.map.frames_fused, 1e3),
+    1,
+)
 MESH = MetricDefinition("mesh_seconds", "mesh (s)", lambda o: stage_seconds(o, "mesh"), 1)
 RATE = MetricDefinition("frames_per_second", "frames / s", lambda o: o.metrics.timing.frames_per_second, 1)
 MEMORY = MetricDefinition("peak_rss_mb", "peak RSS (MiB)", lambda o: o.metrics.timing.peak_rss_mb, 0)
 SECONDS = MetricDefinition("seconds_total", "seconds", lambda o: o.metrics.timing.seconds_total, 1)
-COMMAND = MetricDefinition("command_seconds", "whole command (s)", lambda o: o.process.seconds, 1)
-LOAD = MetricDefinition("load_average", "load before", lambda o: o.process.load, 1)
-TIME = MetricDefinition("ms_per_frame", "ms / frame", lambda o: o.process.ms_per_frame, 1)
-CPU = MetricDefinition("cpu_ms_per_frame", "CPU ms / frame", lambda o: o.process.cpu_ms_per_frame, 1)
+COMMAND = MetricDefinition("command_seconds", "whole command (s)", lambda o: o.seconds, 1)
+LOAD = MetricDefinition("load_average", "load before", lambda o: o.load, 1)
+TIME = MetricDefinition("ms_per_frame", "ms / frame", lambda o: ratio(SECONDS.value(o), FRAMES.value(o), 1e3), 1)
+CPU = MetricDefinition(
+    "cpu_ms_per_frame", "CPU ms / frame", lambda o: ratio(o.metrics.timing.cpu_seconds, FRAMES.value(o), 1e3), 1
+)
 DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
 DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, TRIANGLES)
 DEFINITIONS += (*MAP_ERRORS, *MAP_SIZES[1:], FUSION, MESH)
@@ -151,11 +158,6 @@ def over_seeds(definition: MetricDefinition) -> Cell:
 def average(definition: MetricDefinition) -> Cell:
     """Mean over a group."""
     return lambda group: mean(values(group, definition), definition.decimals)
-
-
-def average_among(definition: MetricDefinition, among: Sequence[JobResult]) -> Cell:
-    """Mean over the results of a group that are also in another one."""
-    return lambda group: mean(values([o for o in group if o in among], definition), definition.decimals)
 
 
 def middle_and_extreme(definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]) -> Cell:

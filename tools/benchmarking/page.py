@@ -8,10 +8,9 @@ import platform
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
-from benchmarking import handheld, kitti
+from benchmarking import handheld
 from benchmarking import metrics as m
 from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, kind, over_seeds, table, values, weights
 from benchmarking.plan import EVERYTHING
@@ -58,24 +57,6 @@ trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG
 Every drive:
 
 {table({"sequence": drive, "weights": weights}, columns, results)}{picture}{notes(results, definitions)}"""
-
-
-def ablation_tables(results: Sequence[JobResult]) -> str:
-    """Ablation: errors relative to those of everything on, then the errors themselves."""
-    errors, others = (m.ATE_7, m.ATE_6, m.R_REL), (m.LOOPS, m.COVERAGE, m.MEMORY)
-    columns = {f"{q.title}: ratio (worst)": against_everything(q, results) for q in errors}
-    columns |= {q.title: m.average(q) for q in others}
-    drives = grouped(results, drive, weights)
-    by_drive = {", ".join(label): m.average_among(m.ATE_7, group) for label, group in drives.items()}
-    rows = {"configuration": m.configuration}
-    return f"""Errors over those of the same sequence, weights and seed with everything on, geometric mean and worst:
-above 1, the part helps. The rest are means.
-
-{table(rows, columns, results)}
-
-{m.ATE_7.title}, metres:
-
-{table(rows, by_drive, results)}{notes(results, (*errors, *others))}"""
 
 
 def maps_tables(results: Sequence[JobResult]) -> str:
@@ -134,27 +115,9 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
 TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
     "accuracy": accuracy_tables,
     "full-size": error_tables,
-    "ablation": ablation_tables,
     "maps": maps_tables,
-    "kitti": lambda results: kitti.tables(results) + notes(results, kitti.MEASURED),
     "handheld": handheld_tables,
 }
-
-
-def against_everything(definition: MetricDefinition, results: Sequence[JobResult]) -> Cell:
-    """Geometric mean and worst of the ratios to the runs with everything on."""
-
-    def key(o: JobResult) -> tuple[str, str, int]:
-        return o.job.drive.name, o.job.weights, o.job.seed
-
-    base = {key(o): values([o], definition) for o in results if o.job.configuration.name == EVERYTHING.name}
-
-    def cell(group: Sequence[JobResult]) -> str:
-        pairs = [(value, *base.get(key(o), [])) for o in group for value in values([o], definition)]
-        ratios = [pair[0] / pair[1] for pair in pairs if len(pair) == 2 and min(pair) > 0]
-        return f"{math.exp(fmean(map(math.log, ratios))):.2f} ({max(ratios):.2f})" if ratios else DASH
-
-    return cell
 
 
 def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition]) -> str:
@@ -175,7 +138,7 @@ def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: st
     commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in results))
     seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
     failed = sum(bool(o.reason) for o in results)
-    return f"""## {_title(mode)}
+    return f"""## {mode.capitalize()}
 
     {command}
 
@@ -184,10 +147,6 @@ Commit {commits}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_tim
 
 {TABLES[mode](results)}
 """
-
-
-def _title(mode: str) -> str:
-    return "KITTI" if mode == "kitti" else mode.capitalize()
 
 
 def speed_section(command: str, tables: str) -> str:
@@ -206,7 +165,7 @@ def with_section(page: str, new: str) -> str:
     """The page with a section in place of the one of the same title; those that no mode writes come last."""
     _, *old = re.split(r"(?m)^(?=## )", page)
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
-    order = [f"## {_title(mode)}" for mode in (*TABLES, "speed")]
+    order = [f"## {mode.capitalize()}" for mode in (*TABLES, "speed")]
     place = {title: number for number, title in enumerate(order)}
     return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=lambda t: place.get(t, len(order))))])
 

@@ -41,16 +41,7 @@ class Configuration:
 
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
-WHOLE = (Configuration("no map", (*QUIET, "mapping.enabled=false")),)
 EVERYTHING = Configuration("everything on", QUIET)
-_PARTS: dict[str, tuple[str, ...]] = {
-    "no image geometry": ("visual_odometry.enabled=false",),
-    "no lengths from the road homography": ("road.enabled=false",),
-    "no gap interpolation": ("gaps.enabled=false",),
-    "no loops": ("loops.enabled=false",),
-    "no fusion": ("mapping.enabled=false",),
-}
-ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _PARTS.items()))
 _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "depth not refined": ("depth.refine=none",),
     "range to 30 m": ("mapping.depth_max_m=30",),

@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,41 +35,15 @@ FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop with a larger error is false
 
 
 @dataclass(frozen=True)
-class DerivedMetrics:
-    """Relative errors, and the number of true and of false accepted loops.
-
-    ``*_percent`` are 7-dof ATE in per cent of the true path, ``of_network`` the optimised over the network's,
-    ``fusion_ms`` the time of fusion for a fused keyframe, without the refinement of its depth.
-    """
-
-    network_percent: float | None = None
-    optimised_percent: float | None = None
-    of_network: float | None = None
-    fusion_ms: float | None = None
-    true_loops: int | None = None
-    false_loops: int | None = None
-
-
-@dataclass(frozen=True)
-class ProcessMetrics:
-    """Seconds of the whole command, load of the machine before, and time of a frame."""
-
-    seconds: float | None = None
-    load: float | None = None
-    ms_per_frame: float | None = None
-    cpu_ms_per_frame: float | None = None
-
-
-@dataclass(frozen=True)
 class JobResult:
-    """The metrics of a job, those derived from them and those of its process, or the reason of its failure."""
+    """The metrics of a job, or the reason of its failure; seconds of the whole command, load of the machine before."""
 
     job: Job
     metrics: Metrics
     commit: str
     reason: str = ""
-    derived: DerivedMetrics = DerivedMetrics()
-    process: ProcessMetrics = ProcessMetrics()
+    seconds: float | None = None
+    load: float | None = None
 
 
 def simulate(drive: BenchmarkSequence) -> None:
@@ -108,15 +83,14 @@ def job_result(job: Job) -> JobResult:
 
 
 def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
-    commit, folder = record.get("identity", {}).get("commit", ""), job.place / "run"
-    reason = record.get("reason", "the benchmark was interrupted")
-    metrics = Metrics.read(folder / METRICS) if (folder / METRICS).is_file() else Metrics()
-    reason = metrics.failure or reason
-    frames, seconds, cpu = metrics.sequence.frames, metrics.timing.seconds_total, metrics.timing.cpu_seconds
-    if reason or frames is None or seconds is None or cpu is None:
-        return JobResult(job, Metrics(), commit, reason or f"its {METRICS} has no timing")
-    process = ProcessMetrics(record["seconds"], record["load"], 1e3 * seconds / frames, 1e3 * cpu / frames)
-    return JobResult(job, metrics, commit, "", derive_metrics(folder, metrics), process)
+    commit, file = record.get("identity", {}).get("commit", ""), job.place / "run" / METRICS
+    metrics = Metrics.read(file) if file.is_file() else Metrics()
+    reason = metrics.failure or record.get("reason", "the benchmark was interrupted")
+    if not reason and metrics.timing.cpu_seconds is None:
+        reason = f"its {METRICS} has no timing"
+    if reason:
+        return JobResult(job, Metrics(), commit, reason)
+    return JobResult(job, metrics, commit, "", record["seconds"], record["load"])
 
 
 def revision(checkout: Path = ROOT) -> str:
@@ -162,28 +136,17 @@ def _read(path: Path) -> dict[str, Any]:
     return tree
 
 
-def derive_metrics(folder: Path, metrics: Metrics) -> DerivedMetrics:
-    """What follows from the metrics of a run and its files."""
-    length, trajectories, stages = metrics.sequence.length_m, metrics.trajectories, metrics.timing.stages
-    network, optimised = trajectories.network.align.dof7.ate_rmse_m, trajectories.optimised.align.dof7.ate_rmse_m
-    fusion = (stages or {}).get("map")
-    return DerivedMetrics(
-        ratio(network, length, 100.0),
-        ratio(optimised, length, 100.0),
-        ratio(optimised, network, 1.0),
-        ratio(fusion, metrics.map.frames_fused, 1e3),
-        *_loops(folder, metrics),
-    )
-
-
 def ratio(part: float | None, whole: float | None, unit: float) -> float | None:
     """A part of a whole, in a unit."""
     return None if part is None or not whole else unit * part / whole
 
 
-def _loops(folder: Path, metrics: Metrics) -> tuple[int | None, int | None]:
-    """Number of true and of false loops; None without truth in metres."""
-    reference = RunFolder.open(folder).trajectory("reference")
+@cache
+def loops(folder: Path) -> tuple[int | None, int | None]:
+    """Number of true and of false loops of a run; None without truth in metres."""
+    if not (folder / METRICS).is_file():
+        return None, None
+    metrics, reference = Metrics.read(folder / METRICS), RunFolder(folder).trajectory("reference")
     if reference is None or not metrics.is_metric or metrics.loops.accepted is None:
         return None, None
     accepted = LoopsFile.read(folder / LOOPS).accepted or []

@@ -8,18 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from erfsfm.common.config_tree import first_problem, read_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.readers.pinhole import Pinhole, impossible, require_plausible
-from erfsfm.common.yaml_file import read_yaml
 
 CAMERA_FILE = "camera.yaml"
 logger = logging.getLogger(__name__)
 
 HIGHEST_M = 1000.0
 _USUAL_HEIGHTS_M = (0.1, 10.0)
-_MOST_TILT_RAD = 0.5  # of lenses that are made to tilt: 0.2
 _COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
 
@@ -48,22 +47,13 @@ class CameraFile(BaseModel):
     )
     source: str | None = Field(default=None, description="a note on where the numbers come from")
 
-    @field_validator("width", "height", "fx", "fy", "cx", "cy", "fps", "camera_height_m", "readout_ms", mode="before")
-    @classmethod
-    def _refuse_truth(cls, value: Any) -> Any:
-        if isinstance(value, bool):
-            raise ValueError("wanted a number")
-        return value
-
     @model_validator(mode="after")
     def _check(self) -> Self:
         height_m = self.camera_height_m
         if not isinstance(height_m, str | None) and not 0 < height_m <= HIGHEST_M:
             raise ValueError(f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}")
         if self.readout_ms > 1e3 / self.fps:
-            raise ValueError(
-                f"readout_ms: a frame is read before the next, within {1e3 / self.fps:g} ms; is {self.readout_ms:g}"
-            )
+            raise ValueError(f"readout_ms: at most {1e3 / self.fps:g}, the time of a frame; is {self.readout_ms:g}")
         problem = impossible(self.pinhole)
         if problem is not None:
             raise ValueError(problem)
@@ -73,8 +63,6 @@ class CameraFile(BaseModel):
         if allowed is not None and len(self.distortion) not in allowed:
             counts = " or ".join(map(str, allowed))
             raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
-        if any(abs(tilt) > _MOST_TILT_RAD for tilt in self.distortion[12:]):
-            raise ValueError(f"distortion: tx and ty tilt the sensor by radians, {_MOST_TILT_RAD:g} at most")
         if self.model == "fov" and not 0 < self.distortion[0] < math.pi:
             raise ValueError(f"distortion: the angle of model fov lies between 0 and pi, is {self.distortion[0]:g}")
         return self
@@ -123,7 +111,7 @@ def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
     try:
         camera = CameraFile.model_validate(keys)
     except ValidationError as error:
-        raise DataError(f"{where}: {_complaints(error)}") from error
+        raise DataError(f"{where}: {first_problem(error)}") from error
     require_plausible(camera.pinhole, where)
     height_m = camera.height_or(None)
     if height_m is not None and not _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1]:
@@ -131,20 +119,3 @@ def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
             "%s: camera_height_m is %g: check that it is the height above the road in metres", where, height_m
         )
     return camera
-
-
-def _complaints(error: ValidationError) -> str:
-    """Every complaint of a validation, on one line, key first."""
-    lines = []
-    for item in error.errors():
-        key = ".".join(str(part) for part in item["loc"][:1])
-        if item["type"] == "missing":
-            lines.append(f"key {key} is missing")
-        elif item["type"] == "extra_forbidden":
-            lines.append(f"key {key} is unknown (known: {', '.join(CameraFile.model_fields)})")
-        elif not key:
-            lines.append(str(item["ctx"]["error"]))
-        else:
-            problem = item["msg"].removeprefix("Value error, ")
-            lines.append(f"{key}: {problem[0].lower() + problem[1:]}, is {item['input']!r}")
-    return "; ".join(dict.fromkeys(lines))

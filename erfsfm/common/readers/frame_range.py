@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from erfsfm.common.errors import ConfigError
-from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES
+from erfsfm.common.readers.kitti import ODOMETRY_DRIVES
 
 EVERYTHING = 10**9
 KINDS = ("folder", "kitti_odometry", "kitti_raw", "simulated")

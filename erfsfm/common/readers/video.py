@@ -105,10 +105,7 @@ class VideoFrames:
             self._rewind()
         while self._next <= index:
             if not self._grab():
-                raise DataError(
-                    f"video {self._path} breaks off at frame {self._next} of {self._frames}: use the frames "
-                    f"0:{self._next}, or copy it again"
-                )
+                raise DataError(f"video {self._path} breaks off at frame {self._next}: use the frames 0:{self._next}")
         read, image = self._capture.retrieve()
         if not read:
             raise DataError(f"video {self._path} frame {index} cannot be decoded: copy it again")
@@ -177,8 +174,5 @@ def _capture(path: Path) -> cv2.VideoCapture:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)  # errors are reported by DataError alone
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
-        raise DataError(
-            f"video {path} cannot be opened: it is damaged or of an unknown format; copy it again, or convert it to "
-            f"mp4 (H.264)"
-        )
+        raise DataError(f"video {path} cannot be opened: copy it again, or convert it to mp4 (H.264)")
     return capture

@@ -6,7 +6,6 @@ import logging
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -29,20 +28,12 @@ def outcome(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     return run
 
 
-def test_a_warning_that_repeats_is_counted() -> None:
+def test_a_warning_that_repeats_is_said_once() -> None:
     program = "import logging\nfrom erfsfm.common import command_line\n"
     program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('images').warning('image %d', k)\n"
     program += " raise OSError('the error')\ncommand_line.run(app, 'program', logging.WARNING)"
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False).stderr
-    counted = "WARNING images: 110 more warnings of this kind"
-    assert said.splitlines() == ["WARNING images: image 0", counted, "program: the error"]
-
-
-def test_the_home_folder_is_meant_in_quotes_too(outcome: Outcome) -> None:
-    seen: list[str] = []
-    outcome(seen.extend, "--output=~/runs", "~/drive", "a~/b", "--set", "output.root=~", "--hazards", "")
-    home = Path.home()
-    assert seen == [f"--output={home / 'runs'}", str(home / "drive"), "a~/b", "--set", "output.root=~", "--hazards", ""]
+    assert said.splitlines() == ["WARNING images: image 0", "program: the error"]
 
 
 def raising(error: Exception) -> Callable[[object], object]:
@@ -59,7 +50,6 @@ def raising(error: Exception) -> Callable[[object], object]:
         (FileNotFoundError(2, "No such file", "a"), "program: a: No such file: check the path"),
         (MemoryError(), "program: memory ran out"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: not enough memory"), "program: memory ran out"),
-        (RuntimeError("can't start new thread"), "program: memory ran out"),
         (ZeroDivisionError("by zero"), "program: unexpected ZeroDivisionError: by zero (test_command_line.py:"),
     ],
 )

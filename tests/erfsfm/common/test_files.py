@@ -6,10 +6,15 @@ import errno
 import os
 import threading
 from pathlib import Path
+from threading import Thread
 
+import cv2
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from erfsfm.common.files import read_bytes, read_text, write_atomically
+from erfsfm.common.errors import BusyError, ConfigError
+from erfsfm.common.files import FIGURE_SUFFIXES, FolderLock, read_bytes, read_text, save_figure, write_atomically
 
 
 @pytest.mark.parametrize("through", ["itself", "a link"])
@@ -49,3 +54,62 @@ def test_a_pipe_is_read(tmp_path: Path) -> None:
     writer.start()
     assert read_text(pipe) == "a\nb"
     writer.join()
+
+
+@pytest.mark.parametrize("suffix", FIGURE_SUFFIXES)
+def test_a_figure_replaces_a_figure_and_equal_ones_are_equal_files(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"figure{suffix}"
+    if suffix != ".svg":  # its ids are random without the style of our plots
+        save_figure(Figure(), path, dpi=50)
+        before = path.read_bytes()
+        save_figure(Figure(), path, dpi=50)
+        assert path.read_bytes() == before
+    else:
+        save_figure(Figure(), path, dpi=50)
+        save_figure(Figure(), path, dpi=60)
+
+
+def test_another_image_stays(tmp_path: Path) -> None:
+    image = tmp_path / "000000.png"
+    cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
+    before = image.read_bytes()
+    with pytest.raises(ConfigError, match=r"000000\.png exists and is no figure of erfsfm: choose another --output"):
+        save_figure(Figure(), image, dpi=50)
+    assert image.read_bytes() == before
+
+
+def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:
+    with FolderLock() as lock:
+        lock.take(tmp_path / "run")
+        with (
+            FolderLock() as other,
+            pytest.raises(BusyError, match=r"another process writes to .*run: wait"),
+        ):
+            other.take(tmp_path / "run")
+    with FolderLock() as lock:
+        lock.take(tmp_path / "run")
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_who_waits_holds_a_folder_after_the_other(tmp_path: Path) -> None:
+    events = []
+
+    def wait() -> None:
+        with FolderLock() as other:
+            other.wait_for(tmp_path)
+            events.append("waited")
+
+    with FolderLock() as lock:
+        lock.wait_for(tmp_path)
+        thread = Thread(target=wait)
+        thread.start()
+        thread.join(0.3)
+        events.append("held")
+    thread.join(30)
+    assert events == ["held", "waited"]
+
+
+def test_where_no_folder_can_be_made_there_is_nothing_to_hold(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with FolderLock() as lock:
+        lock.take(tmp_path / "file" / "run")

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.config import DataConfig
-from erfsfm.data.augmentation import augment, rolled
+from erfsfm.data.augmentation import augment, weathered
 from erfsfm.geometry.camera import Camera
 
 CAMERA = Camera(width=160, height=96, fx=110.0, fy=120.0, cx=77.0, cy=50.0)
@@ -91,11 +91,34 @@ def test_all_frames_get_the_same_colour_change(seed: int) -> None:
     assert first.dtype == np.uint8
 
 
-def test_a_rolled_camera_sees_points_where_it_should_at_the_same_depth() -> None:
-    angle = np.deg2rad(3)
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    for point in POINTS:
-        depth = np.full((CAMERA.height, CAMERA.width), point[2], np.float32)
-        image, (turned,) = rolled(blob(project(CAMERA, point)), [depth], CAMERA, angle, (0,))
-        np.testing.assert_allclose(centre_of(image), project(CAMERA, turn @ point), atol=0.2)
-        assert set(np.unique(turned)) == {np.float32(0), np.float32(point[2])}, "unknown beyond the edges"
+@pytest.fixture
+def images() -> list[NDArray[np.uint8]]:
+    v, u = np.mgrid[:64, :160]
+    spot = np.exp(-((u - 79.5) ** 2 + (v - 31.5) ** 2) / 200)
+    return [np.repeat(np.rint(60 + 150 * spot).astype(np.uint8)[..., None], 3, axis=2)] * 5
+
+
+def test_only_the_seed_decides(images: list[NDArray[np.uint8]]) -> None:
+    first, again, other = (weathered(images, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again))
+    assert any(not np.array_equal(a, b) for a, b in zip(first, other))
+
+
+def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]) -> None:
+    changes = []
+    for seed in range(40):
+        seen = weathered(images, np.random.default_rng(seed))
+        assert [image.shape for image in seen] == [(64, 160, 3)] * 5
+        assert all(image.dtype == np.uint8 for image in seen)
+        changes.append(np.mean([np.abs(image.astype(float) - images[0]).mean() for image in seen]))
+    assert np.mean(np.array(changes) > 3) > 0.6
+    assert max(changes) < 100
+
+
+def test_positions_do_not_change(images: list[NDArray[np.uint8]]) -> None:
+    """The mean over much weather has its brightest place where the clear image has it."""
+    seen = [image.astype(float)[..., 0] for s in range(60) for image in weathered(images, np.random.default_rng(s))]
+    bright = np.maximum(np.mean(seen, axis=0) - 90, 0)
+    v, u = np.mgrid[:64, :160]
+    assert (u * bright).sum() / bright.sum() == pytest.approx(79.5, abs=1.5)
+    assert (v * bright).sum() / bright.sum() == pytest.approx(31.5, abs=1.5)

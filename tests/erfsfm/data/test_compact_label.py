@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.data.compact_label import decode, encode
+from erfsfm.data.many_view_teacher import decode, encode
 
 SIZE = (48, 64)
 Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]

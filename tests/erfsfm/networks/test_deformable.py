@@ -1,6 +1,5 @@
 import itertools
 import math
-import sys
 
 import pytest
 import torch
@@ -80,35 +79,11 @@ CASES = [
 ]
 
 
-ONE_GROUP = [case for case in CASES if case[5] == case[6] == 1]
-
-
-@pytest.fixture
-def compiled(monkeypatch):
-    """Uses the compiled path for every case that it supports, and counts its calls."""
-    kernel = pytest.importorskip("erfsfm.networks.deformable_kernel")
-    monkeypatch.setattr(deformable, "_KERNEL_CHANNELS", 0)
-    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 0)
-    calls = []
-    original = kernel.deform_conv2d
-    monkeypatch.setattr(kernel, "deform_conv2d", lambda *arguments: calls.append(1) or original(*arguments))
-    return calls
-
-
 @pytest.mark.parametrize("chunk", [2**20, 50])  # in one piece, and some outputs at a time
 @pytest.mark.parametrize("case", CASES)
 def test_values_and_gradients_equal_the_definition(case, chunk, monkeypatch):
     monkeypatch.setattr(deformable, "_CPU_CHUNK", chunk)
     check_against_the_definition(case)
-
-
-@pytest.mark.parametrize("chunk, threads", [(2**20, 1), (50, 1), (50, 2)])
-@pytest.mark.parametrize("case", ONE_GROUP)
-def test_compiled_values_and_gradients_equal_the_definition(case, chunk, threads, monkeypatch, compiled):
-    monkeypatch.setattr(sys.modules["erfsfm.networks.deformable_kernel"], "_CHUNK", chunk)
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    check_against_the_definition(case)
-    assert compiled
 
 
 def check_against_the_definition(case):
@@ -152,21 +127,6 @@ def test_zero_offsets_and_unit_mask_are_plain_convolution(stride, padding, dilat
     for factors in (None, mask):
         ours = deform_conv2d(features, offset, weight, bias, stride, padding, dilation, factors)
         torch.testing.assert_close(ours, plain, rtol=0, atol=tolerance)
-
-
-def test_gradients_of_a_whole_layer_agree_on_both_paths(compiled, monkeypatch):
-    torch.manual_seed(0)
-    layer = DeformableConv2d(8, 6, kernel=3, stride=2, padding=1).double()
-    initialise(layer, "paper")
-    features = torch.randn(2, 8, 12, 15, dtype=torch.float64, requires_grad=True)
-    wanted = [features, *layer.parameters()]
-    fast = torch.autograd.grad(layer(features).sin().sum(), wanted)
-    assert len(compiled) == 1
-    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 2**60)
-    plain = torch.autograd.grad(layer(features).sin().sum(), wanted)
-    assert len(compiled) == 1
-    for one, other in zip(fast, plain):
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-10)
 
 
 def test_integer_offset_reads_the_neighbour():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from erfsfm.networks import deformable
+from erfsfm.networks import deformable, onnx_graph
 from erfsfm.networks.deformable import DeformableConv2d
-from erfsfm.networks.onnx_graph import OnnxGraph
+from erfsfm.networks.onnx_graph import Array, OnnxGraph, folder, keep, kept
 from erfsfm.networks.presets import build
 from erfsfm.networks.torch_network import tensors
 
@@ -48,7 +50,7 @@ def calls_of(network: nn.Module) -> list[object]:
 )
 @torch.inference_mode()
 def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 2**40)  # all in plain PyTorch
+    monkeypatch.setattr(deformable, "_LARGE", 2**40)  # all in plain PyTorch
     kind = "depth" if "depth" in name else "pose"
     network = with_moving_taps(build(name, width=0.125, sources=4))
     given = [inputs(kind, seed) for seed in range(3)]
@@ -63,10 +65,66 @@ def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, m
 
 @torch.inference_mode()
 def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 1)
+    monkeypatch.setattr(deformable, "_LARGE", 1)
     network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
     graph, calls = OnnxGraph(lambda: network, 1), calls_of(network)
     graph(*inputs("depth", 0))
     before = len(calls)
     graph(*inputs("depth", 0))
     assert len(calls) == before + 1
+
+
+NO_CODE = shutil.ignore_patterns("weights", "__pycache__")
+IMAGE = np.ones((1, 3, 4, 4), np.float32)
+
+
+class Times(nn.Module):
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        self.factor = factor
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.factor * image
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+
+
+def output(factor: float, identity: str, image: Array = IMAGE) -> float:
+    return float(OnnxGraph(lambda: Times(factor).eval(), 1, identity)(image).max())
+
+
+def kept_graph(made_from: str, made: bytes) -> bytes:
+    graph = kept(made_from)
+    if graph is None:
+        keep(made_from, made)
+    return made if graph is None else graph
+
+
+def test_the_graph_of_a_network_is_read_again_and_no_other(tmp_path: Path) -> None:
+    assert output(2.0, "two") == 2.0
+    assert folder() == tmp_path / "erfsfm" and len(list(folder().iterdir())) == 1
+    assert output(3.0, "two") == 2.0, "the graph was made again"
+    assert output(3.0, "three") == 3.0
+    assert output(3.0, "two", np.ones((1, 3, 8, 8), np.float32)) == 3.0, "the graph is of images of another size"
+    assert output(5.0, "") == 5.0
+
+
+def test_a_damaged_graph_is_made_again() -> None:
+    assert kept_graph("one", b"graph") == b"graph"
+    (file,) = folder().iterdir()
+    for content in (b"", file.read_bytes()[:-1], file.read_bytes().replace(b"graph", b"graff")):
+        file.write_bytes(content)
+        assert kept_graph("one", b"graph") == b"graph"
+    assert kept_graph("one", b"another") == b"graph"
+
+
+@pytest.mark.parametrize("changed", ["networks/blocks.py", "geometry/alignment.py"])
+def test_a_graph_of_older_code_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
+    package = shutil.copytree(Path(onnx_graph.__file__).parents[1], tmp_path / "code", ignore=NO_CODE)
+    monkeypatch.setattr(onnx_graph, "__file__", str(package / "networks" / "onnx_graph.py"))
+    assert kept_graph("one", b"old") == b"old" == kept_graph("one", b"new")
+    (package / changed).write_text("# changed")
+    assert kept_graph("one", b"new") == b"new"

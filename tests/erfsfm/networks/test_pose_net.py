@@ -59,25 +59,10 @@ def test_stage_sizes(variant, fidelity, wanted):
     assert stage_sizes(PoseNet(variant, fidelity, width=0.1), (128, 416)) == wanted
 
 
-@pytest.mark.parametrize("size", [(128, 416), (75, 248), (32, 48)])
-def test_masks_match_the_disparity_pyramid(size):
-    network = PoseNet(width=0.1, sources=2, mask_branch=True)
-    target, sources = images(2, size)
-    poses, masks = network.forward_with_masks(target, sources)
-    torch.testing.assert_close(poses, network(target, sources))
-    height, width = size
-    for mask in masks:
-        assert mask.shape == (2, 2, height, width)
-        assert mask.min() > 0 and mask.max() < 1
-        height, width = -(-height // 2), -(-width // 2)
-    assert len(masks) == 4
-
-
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("normalisation", ["none", "batch"])
 def test_every_weight_has_a_gradient(variant, normalisation):
-    network = PoseNet(variant, width=0.5, sources=2, normalisation=normalisation, mask_branch=True)
-    poses, masks = network.forward_with_masks(*images(2, (130, 161)))
-    (poses.sum() + sum((mask * torch.rand_like(mask)).sum() for mask in masks)).backward()
+    network = PoseNet(variant, width=0.5, sources=2, normalisation=normalisation)
+    network(*images(2, (130, 161))).sum().backward()
     silent = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()]
     assert not silent

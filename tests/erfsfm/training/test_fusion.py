@@ -12,8 +12,7 @@ import torch
 
 from erfsfm.cli import main
 from erfsfm.mvs.fusion import CHANGE, CHANNELS
-from erfsfm.networks.fusion_net import FusionNet
-from erfsfm.training.fusion import fusion_loss
+from erfsfm.training.fusion import FusionNet, fusion_loss
 
 Cli = Callable[..., tuple[int, str, str]]
 

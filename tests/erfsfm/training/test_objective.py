@@ -35,25 +35,15 @@ class FixedDepth(nn.Module):
 
 
 class FixedPose(nn.Module):
-    """The same motion whatever the images; masks of one value."""
+    """The same motion whatever the images."""
 
-    def __init__(self, vectors: Tensor, mask: float = 1.0, shrink: int = 0) -> None:
+    def __init__(self, vectors: Tensor) -> None:
         super().__init__()
         self.vectors = nn.Parameter(vectors)
-        self.mask = mask
-        self.shrink = shrink
 
     def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
         assert len(sources) == self.vectors.shape[0]
         return self.vectors.expand(len(target), -1, -1)
-
-    def forward_with_masks(self, target: Tensor, sources: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        height, width = (math.ceil(n - self.shrink) for n in target.shape[-2:])
-        masks = [
-            target.new_full((len(target), len(sources), math.ceil(height / 2**s), math.ceil(width / 2**s)), self.mask)
-            for s in range(4)
-        ]
-        return self(target, sources), masks
 
 
 def true_poses() -> Tensor:
@@ -61,9 +51,9 @@ def true_poses() -> Tensor:
     return torch.tensor([[*(-np.array(place)), 0, 0, 0] for place in PLACES], dtype=torch.float64)
 
 
-def experiment(masks: bool = False, fidelity: str = "default", **loss: Any) -> ExperimentConfig:
+def experiment(fidelity: str = "default", **loss: Any) -> ExperimentConfig:
     return ExperimentConfig.model_validate(
-        {"network": {"sources": 2, "masks": masks, "fidelity": fidelity}, "loss": {"smoothness_weight": 0.0} | loss}
+        {"network": {"sources": 2, "fidelity": fidelity}, "loss": {"smoothness_weight": 0.0} | loss}
     )
 
 
@@ -265,17 +255,6 @@ def test_auto_mask_keeps_what_moves(batch: SnippetBatch, plane, reduction: str) 
     plain = evaluate(half_still, experiment(reduction=reduction, scales=1), 1 / plane.distance, true_poses())
     masked = evaluate(half_still, config, 1 / plane.distance, true_poses())
     assert float(masked.total) < 0.3 * float(plain.total), "the still half adds no error at the true depth"
-
-
-def test_masks_weigh_the_error_and_are_regularised_towards_one(batch: SnippetBatch) -> None:
-    plain = float(evaluate(batch, experiment(), 0.3, true_poses()).total)
-    config = experiment(masks=True, mask_weight=0.1)
-    depth_net, pose_net = FixedDepth(0.3), FixedPose(true_poses(), mask=0.5)
-    with torch.no_grad():
-        outcome = evaluate_objective(depth_net, pose_net, batch, config)
-    assert float(outcome.terms["photometric"]) == pytest.approx(plain / 2)
-    assert float(outcome.terms["explainability"]) == pytest.approx(4 * math.log(2))
-    assert float(outcome.total) == pytest.approx(plain / 2 + 0.4 * math.log(2))
 
 
 def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> None:

@@ -20,7 +20,7 @@ from meshes import coloured_ply
 from erfsfm.checkpoint import load_model
 from erfsfm.common.readers.camera_file import read_camera_file
 from erfsfm.common.readers.images import read_image, read_values
-from erfsfm.common.readers.kitti_sensors import read_packet
+from erfsfm.common.readers.kitti import read_packet
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import load_experiment
 from erfsfm.convert import read_old

@@ -148,10 +148,9 @@ def test_two_contradictions_are_two_warnings(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
-    terminal = Terminal(logging.WARNING)
+    Terminal(logging.WARNING)
     for each in (agreement.Agreement("lidar", 3.0, "50 % off"), agreement.Agreement("GPS", 4.0, "far")):
         each.said()
-    terminal.count()
     assert "lidar contradicts" in (said := capsys.readouterr().err) and "GPS contradicts" in said
 
 

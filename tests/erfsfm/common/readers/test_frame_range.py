@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange, merge, overlapping
-from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES
+from erfsfm.common.readers.kitti import ODOMETRY_DRIVES
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.kitti_drives import drive_name, find_drives, find_odometry_root, odometry_camera
+from erfsfm.common.readers.kitti import CalibrationFile, drive_name, find_drives, find_odometry_root, odometry_camera
+from slam.geometry import se3
+from slam.geometry.se3 import invert
 
 
 @pytest.mark.parametrize("given", ["root[1]", "root[1]/dataset", "root[1]/dataset/sequences"])
@@ -38,3 +41,38 @@ def test_drives(tmp_path: Path) -> None:
     assert drive_name("2011_09_26/2011_09_26_drive_0001_sync") == names[0]
     with pytest.raises(DataError, match="is not rectified"):
         find_drives(date / "2011_09_26_drive_0003_extract")
+
+
+@pytest.fixture
+def calibration(tmp_path: Path):
+    def write(text: str) -> CalibrationFile:
+        (tmp_path / "calib.txt").write_text(text)
+        return CalibrationFile(tmp_path / "calib.txt")
+
+    return write
+
+
+def test_lever_arm_by_hand(calibration) -> None:
+    """KITTI's own colour camera: P2's column over the focal length is 6 cm, so camera 2 is 6 cm LEFT of 0."""
+    text = "P2: 718.856 0 607.1928 45.38225 0 718.856 185.2157 -0.1130887 0 0 1 0.003779761"
+    file = calibration(text)
+    T_camera_cam0 = file.T_camera_cam0("P2")
+    z = 0.003779761
+    assert T_camera_cam0[:3, 3] == pytest.approx(
+        [(45.38225 - 607.1928 * z) / 718.856, (-0.1130887 - 185.2157 * z) / 718.856, z]
+    )
+    T_cam0_camera = invert(T_camera_cam0)
+    assert T_cam0_camera[0, 3] == pytest.approx(-0.0599, abs=1e-4)
+    # reference is P itself: it projects a point of camera 0 to where K projects the translated point
+    point_cam0 = np.array([1.0, -0.5, 8.0])
+    P = file.matrix("P2", (3, 4))
+    by_P = P @ [*point_cam0, 1.0]
+    by_K = P[:, :3] @ se3.apply(se3.invert(T_cam0_camera), point_cam0[None])[0]
+    assert by_K == pytest.approx(by_P)
+
+
+def test_rotation_of_the_rig_translates_the_side_camera() -> None:
+    T_camera_cam0 = se3.make(np.eye(3), np.array([0.5, 0.0, 0.0]))  # the camera is 0.5 m left of camera 0
+    turn_right = se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.zeros(3))
+    T_world_camera = np.stack([np.eye(4), turn_right]) @ invert(T_camera_cam0)
+    assert T_world_camera[:, :3, 3] == pytest.approx(np.array([[-0.5, 0, 0], [0, 0, 0.5]]), abs=1e-12)

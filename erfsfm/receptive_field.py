@@ -1,20 +1,27 @@
-"""Receptive fields of networks: theoretical, by gradients, and effective with trained weights; a street to see."""
+"""Receptive fields of networks: theoretical, by gradients, and effective with trained weights, as numbers and drawn.
+
+The paper compares its networks by these fields (its figure 4).
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ConfigError
-from erfsfm.common.readers.kitti_calibration import CAMERA_HEIGHT_M
+from erfsfm.common.files import save_figure
 from erfsfm.common.table import Table
 from erfsfm.config import Fidelity
 from erfsfm.networks.presets import PRESETS, build
@@ -24,7 +31,14 @@ from erfsfm.networks.receptive_field import MeasuredField, Network, effective, m
 _PROBE_WIDTH = 0.1
 _UNTRAINED_WIDTH = 0.25
 HELD = 0.95
-_HALF_WIDTH_M = 7.0
+_WIDTH_IN = 12.0
+_DIM = 0.3  # brightness of pixels that are never read
+_BOX, _MEASURED, _HEAT = "#ffd23f", "#3ec7f2", "inferno"
+_TITLE = (
+    "Receptive field of the middle output of the last encoder layer\nleft: bright pixels can reach it; blue: their "
+    f"bounding box; dashed: theoretical box.  right: gradient magnitude, {HELD:.0%} of which is in the stated share"
+)
+_HEIGHT_M, _HALF_WIDTH_M = 1.65, 7.0  # of the synthetic street: camera over the road, and walls beside it
 _FOCAL_SHARE = 0.58  # focal length over image width, as KITTI's
 
 
@@ -35,18 +49,19 @@ class FieldRow:
     Attributes:
         name: preset.
         fidelity: ``paper`` or ``default``.
+        weights: name of the learned weights of `weighed`, or ``untrained``.
         offsets_px: outward offset of deformable taps in `seen`, pixels; 0 for other networks.
         side_px: theoretical side with taps moved by `offsets_px`.
         side_at_rest_px: theoretical side at zero offsets.
         corner: image row and column of the theoretical box, taps moved.
         seen: support of the pixel's gradient, with constant weights.
         union_share: fraction of the image in the support of any pixel of the layer.
-        weighed: effective field on an image, with the weights named by `weights`.
-        weights: name of the learned weights, or ``untrained``.
+        weighed: effective field on an image.
     """
 
     name: str
     fidelity: Fidelity
+    weights: str
     offsets_px: float
     side_px: int
     side_at_rest_px: int
@@ -54,7 +69,11 @@ class FieldRow:
     seen: MeasuredField
     union_share: float
     weighed: MeasuredField
-    weights: str
+
+    @property
+    def title(self) -> str:
+        """The network's name, marked where it is the paper's."""
+        return self.name + (" (paper)" if self.fidelity == "paper" else "")
 
     def summary(self) -> dict[str, Any]:
         """The numbers by name, in pixels and fractions of the image."""
@@ -107,13 +126,55 @@ def measure_fields(
 def field_table(rows: Sequence[FieldRow]) -> Table:
     """The summaries of rows."""
     texts = []
-    for row in (row.summary() for row in rows):
-        name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
-        ratios = (f"{row[key]:.1%}" for key in ("share", "share_of_all_outputs", "effective_share_95"))
-        box = f"{row['columns']} x {row['rows']}"
-        texts.append([name, row["weights"], f"{row['theoretical_px']} px", box, *ratios])
+    for row in rows:
+        shares = (row.seen.coverage, row.union_share, row.weighed.share_holding(HELD))
+        box = f"{row.seen.columns} x {row.seen.rows}"
+        texts.append([row.title, row.weights, f"{row.side_px} px", box, *(f"{share:.1%}" for share in shares)])
     head = ["network", "weights", "theory", "columns x rows", "share", "all outputs", "95 % in"]
     return Table(head, texts, names=2)
+
+
+def draw_fields(rows: Sequence[FieldRow], image: NDArray[np.uint8], path: Path) -> None:
+    """Write the figure: a row for each network, its support on the left, its effective field on the right.
+
+    Args:
+        rows: what to show.
+        image: ``(H, W, 3)`` uint8 RGB, the middle image of the input snippet.
+        path: its ending names the format: png, pdf or svg.
+    """
+    height, width = image.shape[:2]
+    panel = _WIDTH_IN / 2 * height / width
+    figure = Figure(figsize=(_WIDTH_IN, (panel + 0.2) * len(rows) + 0.6), layout="constrained")
+    for row, (left, right) in zip(rows, figure.subplots(len(rows), 2, squeeze=False)):
+        _draw_seen(left, row, image)
+        _draw_weighed(right, row, image)
+        for axis in (left, right):
+            axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    figure.suptitle(_TITLE, fontsize=9)
+    save_figure(figure, path, dpi=150)
+
+
+def _draw_seen(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
+    field = row.seen
+    read = field.gradient.cpu().numpy() > 0
+    axis.imshow(np.where(read[..., None], image, (image * _DIM).astype(np.uint8)), interpolation="nearest")
+    boxes = [(*row.corner, row.side_px, row.side_px, _BOX, "--")]
+    boxes += [(field.top, field.left, field.rows, field.columns, _MEASURED, "-")] if field.rows else []
+    for top, left, rows, columns, colour, style in boxes:
+        axis.add_patch(Rectangle((left - 0.5, top - 0.5), columns, rows, fill=False, edgecolor=colour, linestyle=style))
+    taps = f", taps pushed {row.offsets_px:g} px" if row.offsets_px else ""
+    said = f"{row.title}{taps}: {row.side_px} px in theory, box {field.columns} x {field.rows}"
+    axis.set_title(f"{said}, {field.coverage:.1%} of the image", fontsize=7.5, loc="left", pad=3)
+
+
+def _draw_weighed(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
+    weight = row.weighed.gradient.cpu().double().numpy()
+    axis.imshow(np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8), alpha=0.5)
+    strength = np.sqrt(weight / max(weight.max(), 1e-30))
+    axis.imshow(strength, cmap=_HEAT, alpha=np.clip(1.6 * strength, 0, 0.95), vmin=0, vmax=1)
+    ratio = row.weighed.share_holding(HELD)
+    extent = f"{HELD:.0%} in {ratio:.1%} of the image" if ratio else "nothing: no pixel influences the output"
+    axis.set_title(f"weights: {row.weights}; {extent}", fontsize=7.5, loc="left", pad=3)
 
 
 def _row(
@@ -125,21 +186,24 @@ def _row(
     device: str,
 ) -> FieldRow:
     probe = build(name, fidelity, _PROBE_WIDTH).to(device)
-    size = snippet[0].shape[:2]
-    pushed = offsets_px if any(layer.deformable for layer in probe.encoder_layers()) else 0.0
+    height, width = snippet[0].shape[:2]
+    size = (height, width)
+    pushed = offsets_px if any(layer.deformable for layer in probe.encoder.layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
+    outputs = itertools.product(range(seen.map_size[0]), range(seen.map_size[1]))
+    supports = [measured(probe, size, output, pushed).gradient > 0 for output in outputs]
     network, weights = _with_weights(name, fidelity, learned)
     return FieldRow(
-        name=name,
-        fidelity=fidelity,
-        offsets_px=pushed,
+        name,
+        fidelity,
+        weights,
+        pushed,
         side_px=theoretical(probe, pushed),
         side_at_rest_px=theoretical(probe),
         corner=theoretical_corner(probe, seen.pixel, pushed),
         seen=seen,
-        union_share=_union_share(probe, size, pushed, seen.map_size),
+        union_share=float(torch.stack(supports).any(dim=0).double().mean()),
         weighed=effective(network.to(device), _encoder_input(snippet, network).to(device)),
-        weights=weights,
     )
 
 
@@ -155,13 +219,6 @@ def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | No
     return build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
 
 
-def _union_share(network: Network, size: tuple[int, int], offsets_px: float, map_size: tuple[int, int]) -> float:
-    """Fraction of the image's pixels with a gradient to any output pixel."""
-    pixels = itertools.product(range(map_size[0]), range(map_size[1]))
-    fields = [measured(network, size, pixel, offsets_px).gradient > 0 for pixel in pixels]
-    return float(torch.stack(fields).any(dim=0).double().mean())
-
-
 def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Tensor:
     """``(1, C, H, W)`` in [-1, 1]: the middle image, for a pose network with its sources behind it."""
     sources = network.input_channels // 3 - 1
@@ -172,41 +229,24 @@ def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Te
     return stacked.reshape(1, -1, *images.shape[1:3]).float() / 127.5 - 1
 
 
-def street_snippet(frames: int, height: int, width: int, step_m: float = 1.0) -> list[NDArray[np.uint8]]:
-    """Consecutive views of a straight drive, in time order.
-
-    Args:
-        frames: how many.
-        height: of each view, pixels.
-        width: of each view, pixels.
-        step_m: forward motion between views.
-
-    Returns:
-        Images ``(height, width, 3)`` uint8 RGB.
-    """
-    return [_view(height, width, k * step_m) for k in range(frames)]
+def street_snippet(frames: int, height: int, width: int) -> list[NDArray[np.uint8]]:
+    """Consecutive views ``(height, width, 3)`` uint8 RGB of a straight drive between walls, a metre a frame."""
+    return [_view(height, width, float(k)) for k in range(frames)]
 
 
 def _view(height: int, width: int, z_m: float) -> NDArray[np.uint8]:
     v, u = np.mgrid[:height, :width]
     ray_x = (u - (width - 1) / 2) / (_FOCAL_SHARE * width)
     ray_y = (v - (height - 1) / 2) / (_FOCAL_SHARE * width)
-    to_road = CAMERA_HEIGHT_M / np.maximum(ray_y, 1e-6)  # z-depth in metres
+    to_road = _HEIGHT_M / np.maximum(ray_y, 1e-6)  # z-depth in metres
     to_wall = _HALF_WIDTH_M / np.maximum(np.abs(ray_x), 1e-6)
     depth = np.minimum(to_road, to_wall)
     x, y, z = ray_x * depth, ray_y * depth, z_m + depth
     wall = to_wall < to_road
-    sky = wall & (y < -6 - 2 * np.sin(np.floor(z / 9) * 2.4))
     lane = (np.abs(np.abs(x) - 2) < 0.12) & (np.mod(z, 6) < 3)
     window = (np.mod(z, 3) < 1.2) & (np.mod(y, 2.5) < 1.3)
-    shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * _grain(np.where(wall, y, x), z)
-    shade = np.where(sky, 0.92, shade / (1 + depth / 300))
-    tint = np.where(sky[..., None], [0.85, 0.93, 1.0], np.where(wall[..., None], [1.0, 0.9, 0.8], [0.95, 0.97, 1.0]))
-    return np.asarray(np.rint(255 * np.clip(shade[..., None] * tint, 0, 1)), dtype=np.uint8)
-
-
-def _grain(across: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A texture in [-1, 1] fixed to the world."""
-    waves = [np.sin(a * across + b * along + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9), (3.3, 0.4))]
-    texture: NDArray[np.float64] = np.mean(waves, axis=0)
-    return texture
+    across = np.where(wall, y, x)
+    grain = np.mean([np.sin(a * across + b * z + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9))], axis=0)
+    shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * grain
+    shade = np.where(wall & (y < -6), 0.92, shade / (1 + depth / 300))  # sky above the walls
+    return np.repeat(np.rint(255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.labels.many_views import label
-from erfsfm.labels.refined_depth import in_camera_heights, refined_label, shrunk
+from erfsfm.labels.many_views import in_camera_heights, label, refined_label, shrunk
 from erfsfm.mvs.flow import Array, measure
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet

@@ -1,6 +1,6 @@
 import pytest
 
-from erfsfm.receptive_field.measure import measure_fields, street_snippet
+from erfsfm.receptive_field import measure_fields, street_snippet
 
 SNIPPET = street_snippet(5, 128, 416)
 

@@ -88,6 +88,9 @@ class DataConfig(Section):
     validation_snippets: int = Field(default=60, ge=1, description="number of snippets in each validation")
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
     zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
+    roll: float = Field(
+        default=0.0, ge=0, le=30, description="largest roll of the camera in labelled single images, degrees"
+    )
     colour_jitter: float = Field(
         default=0.0, ge=0, le=0.5, description="largest relative change of brightness, contrast, gamma"
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +41,30 @@ def augment(
     if config.colour_jitter > 0:
         images = _recolour(images, config.colour_jitter, rng)
     return images, maps, camera, mirrored
+
+
+def rolled(
+    image: NDArray[np.uint8], maps: Maps, camera: Camera, angle: float, unknown: Sequence[float]
+) -> tuple[NDArray[np.uint8], Maps]:
+    """The image ``(H, W, 3)`` and maps of the camera turned about its optical axis, which leaves z-depth as it is.
+
+    Args:
+        image: of the camera.
+        maps: ``(H, W)`` each.
+        camera: of them.
+        angle: radians.
+        unknown: value of each map beyond the image's edges, where the image is mirrored.
+    """
+    K = camera.K.astype(np.float64)
+    cos, sin = np.cos(angle), np.sin(angle)
+    move = (K @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ np.linalg.inv(K))[:2]
+    size = (camera.width, camera.height)
+    turned = cv2.warpAffine(image, move, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    nearest = [
+        cv2.warpAffine(values, move, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=value)
+        for values, value in zip(maps, unknown, strict=True)
+    ]
+    return np.asarray(turned, np.uint8), nearest
 
 
 def _scale_crop(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.augmentation import Maps, augment, weathered
+from erfsfm.data.augmentation import Maps, augment, rolled, weathered
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.structure import HEIGHTS, TeacherStructure
 
@@ -71,6 +71,9 @@ def single_image(
     if rng.random() < config.data.weather:
         image = weathered([image], rng)[0]
     maps = [bound.astype(np.float32) for bound in bounds]
+    if config.data.roll > 0:
+        angle = np.deg2rad(rng.uniform(-config.data.roll, config.data.roll))
+        image, maps = rolled(image, maps, camera, angle, (0, np.inf))
     images, maps, varied, _ = augment([image], maps, camera, config.data, config.network.fidelity, rng)
     sample = {"target": _stacked(images)[0], "K": torch.from_numpy(varied.K)}
     return sample | _bounds(maps, _nearer(varied, config))

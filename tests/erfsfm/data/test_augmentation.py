@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.config import DataConfig
-from erfsfm.data.augmentation import augment, weathered
+from erfsfm.data.augmentation import augment, rolled, weathered
 from erfsfm.geometry.camera import Camera
 
 CAMERA = Camera(width=160, height=96, fx=110.0, fy=120.0, cx=77.0, cy=50.0)
@@ -57,6 +57,16 @@ def test_maps_move_with_the_images(seed: int) -> None:
     v, u = np.mgrid[:96, :160]
     centre = np.array([(u * moved).sum(), (v * moved).sum()]) / moved.sum()
     np.testing.assert_allclose(centre, centre_of(varied), atol=0.25)
+
+
+def test_a_rolled_camera_sees_points_where_it_should_at_the_same_depth() -> None:
+    angle = np.deg2rad(3)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    for point in POINTS:
+        depth = np.full((CAMERA.height, CAMERA.width), point[2], np.float32)
+        image, (turned,) = rolled(blob(project(CAMERA, point)), [depth], CAMERA, angle, (0,))
+        np.testing.assert_allclose(centre_of(image), project(CAMERA, turn @ point), atol=0.2)
+        assert set(np.unique(turned)) == {np.float32(0), np.float32(point[2])}, "unknown beyond the edges"
 
 
 def test_the_papers_flip_is_one_pixel_off() -> None:

@@ -15,6 +15,7 @@ from slam.frames import Ends, Intrinsics, RelativePose, runs
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.segments import named
+from slam.frontend.step_table import triangulated
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
@@ -152,7 +153,7 @@ def of_images(
         needs_road: whether lengths are measured on the road.
     """
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
-    steps = 0 if drive.maps else len(drive.steps.triangulated)  # lengths are then those of the maps
+    steps = 0 if drive.maps else len(triangulated(drive.steps))  # lengths are then those of the maps
     on_road = len(drive.road_steps)
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated"

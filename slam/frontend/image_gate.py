@@ -100,10 +100,11 @@ class ImageGate:
             # images after a dark one are not compared with those before it
             self._state = replace(self._state, shrunk=None, difference=0.0)
             return MeasurementFailure("the image is blank")
-        thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+        shrunk = _shrunk(frame.grey)
+        thumbnail = cv2.resize(shrunk, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         if float(thumbnail.std()) < _NOISE_CONTRAST * contrast:
             return MeasurementFailure("the image is noise")
-        return self._compared(_shrunk(frame.grey))
+        return self._compared(shrunk)
 
     def _compared(self, shrunk: _Layer) -> Verdict:
         """Compare an image with the last new one: its exposure, and whether it is a re-encoded copy of it.
@@ -140,8 +141,10 @@ def _standing(change: _Layer, shrunk: _Layer) -> Mask | None:
 
 
 def _shrunk(grey: Grey) -> _Layer:
+    """Without the last rows and columns that fill no pixel: whole pixels are averaged ten times as fast."""
     height, width = (max(side // _SHRINKING, 1) for side in grey.shape)
-    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    whole = grey[: _SHRINKING * height, : _SHRINKING * width]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _difference(before: _Layer, now: _Layer) -> float:

@@ -31,6 +31,7 @@ from slam.frontend.scale.scale_estimate import (
     scale_from_distance,
     scale_from_reference,
 )
+from slam.frontend.step_table import triangulated
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
@@ -314,7 +315,7 @@ class SlamPipeline:
             SlamError: lengths by LiDAR alone, or depth from elsewhere, are wrong.
         """
         steps = usable_steps(lidar, are_needed=self.mode == "lidar")
-        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated)]
+        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, triangulated(drive.steps))]
         if (height := height_by_lidar(steps, drive)) is not None:
             by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self.sequence.camera_height_m, 0.0))
         worst = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)

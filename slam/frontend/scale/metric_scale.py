@@ -19,7 +19,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_from_road, scale_track
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
-from slam.frontend.step_table import links
+from slam.frontend.step_table import links, triangulated
 from slam.frontend.visual.motion import Motion
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
@@ -94,7 +94,7 @@ def find_scale(
 
     Without a road in most frames, the planes that were found give no unit that means anything.
     """
-    motions, frames = drive.steps.triangulated, len(drive)
+    motions, frames = triangulated(drive.steps), len(drive)
     metres = _lengths(lidar_steps)
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
@@ -159,7 +159,7 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     if not heights:
         heights = [
             metres[ends] / motion.length_unscaled * plane.height_unscaled
-            for ends, motion in drive.steps.triangulated.items()
+            for ends, motion in triangulated(drive.steps).items()
             if ends in metres and isinstance(plane := drive.roads[ends[0]], GroundPlane)
         ]
     return float(np.median(heights)) if heights else None

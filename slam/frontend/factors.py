@@ -21,7 +21,7 @@ from slam.frontend.network_factors import (
 )
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import Steps, links, triangulated
-from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
+from slam.frontend.visual.step_noise import inflate_step_sigmas
 from slam.geometry.se3 import FloatArray, compose, rigid
 
 logger = logging.getLogger(__name__)
@@ -111,11 +111,11 @@ def _geometric(steps: Steps, scale: Scale) -> list[RelativePose]:
     return factors
 
 
-def _step_noise(steps: Steps, scale: Scale) -> Mapping[Ends, StepNoise]:
-    """Noise of the triangulated steps besides that of the corners, by their order in the drive."""
+def _step_noise(steps: Steps, scale: Scale) -> Mapping[Ends, FloatArray]:
+    """Sigmas ``(6,)`` of the triangulated steps besides that of the corners, by their order in the drive."""
     motions = triangulated(steps)
     place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}
     T_by_place = {n: motions[ends].relative_pose.T_from_to for ends, n in place.items()}
-    own = {n: motions[ends].own_noise for ends, n in place.items()}
+    own = {n: motions[ends].corner_sigmas for ends, n in place.items()}
     inflated = inflate_step_sigmas(T_by_place, own)
     return {ends: inflated[n] for ends, n in place.items()}

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.frames import Ends, RelativePose
-from slam.frontend.visual.step_noise import StepNoise
 from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_RELATIVE_SIGMA = 1e-3
@@ -45,23 +44,22 @@ class Motion:
         return float(np.linalg.norm(self.relative_pose.T_from_to[:3, 3]))
 
     @property
-    def own_noise(self) -> StepNoise:
-        """Sigmas of rotation and direction by the corners' own covariance.
+    def corner_sigmas(self) -> FloatArray:
+        """Sigmas ``(6,)`` of rotation and direction by the corners' own covariance.
 
         Raises:
             ValueError: its direction was not measured separately from its length.
         """
         if self.covariance is None:
             raise ValueError(f"a motion by {self.relative_pose.source} has no separate noise of its direction")
-        sigmas = np.sqrt(np.diag(self.covariance))
-        return StepNoise(sigmas[:3], sigmas[3:])
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def with_pose(self, T_from_to: FloatArray) -> Motion:
         """The same with another pose ``(4, 4)``."""
         return replace(self, relative_pose=replace(self.relative_pose, T_from_to=T_from_to))
 
     def with_length(
-        self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: StepNoise
+        self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: FloatArray
     ) -> RelativePose:
         """The same rotation and direction with another length, and noise besides that of the corners.
 
@@ -69,14 +67,13 @@ class Motion:
             length: in any unit, that of the result.
             relative_sigma: of the length.
             relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
-            noise: of rotation and direction, added in squares to that of the corners.
+            noise: sigmas ``(6,)`` of rotation and direction, added in squares to those of the corners.
         """
-        corners = self.own_noise
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / self.length_unscaled
-        rotation, direction = np.hypot(corners.rotation, noise.rotation), np.hypot(corners.direction, noise.direction)
+        of_unit_pose = np.hypot(self.corner_sigmas, noise)
         sigmas, correlated_sigmas = (
-            pose_sigmas(T_previous_current, rotation, direction, sigma)
+            pose_sigmas(T_previous_current, of_unit_pose, sigma)
             for sigma in (relative_sigma, relative_correlated_sigma)
         )
         return replace(
@@ -103,18 +100,15 @@ class RelativeRotation:
         return self.from_index, self.to_index
 
 
-def pose_sigmas(
-    T_previous_current: FloatArray, rotation: FloatArray, direction: FloatArray, length_relative_sigma: float
-) -> FloatArray:
+def pose_sigmas(T_previous_current: FloatArray, of_unit_pose: FloatArray, length_relative_sigma: float) -> FloatArray:
     """Sigmas ``(6,)`` of a pose in the current camera, where GTSAM perturbs.
 
     Args:
         T_previous_current: the pose ``(4, 4)``.
-        rotation: sigmas ``(3,)``, radians.
-        direction: sigmas of the direction ``(3,)``, radians.
+        of_unit_pose: sigmas ``(6,)`` of its rotation and direction, radians.
         length_relative_sigma: of the length.
     """
     along = np.abs(invert(T_previous_current)[:3, 3])
     length = float(np.linalg.norm(along))
-    translation = np.hypot(length * direction, length_relative_sigma * along)
-    return np.concatenate([rotation, np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)])
+    translation = np.hypot(length * of_unit_pose[3:], length_relative_sigma * along)
+    return np.concatenate([of_unit_pose[:3], np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)])

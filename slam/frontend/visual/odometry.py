@@ -345,8 +345,8 @@ class VisualOdometry:
         last, earlier = self._state.last, self._state.points
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
         ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
-        corner_sigmas, relative = np.sqrt(np.diag(covariance)), max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
-        sigmas = pose_sigmas(T_previous_current, corner_sigmas[:3], corner_sigmas[3:], relative)
+        relative = max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
+        sigmas = pose_sigmas(T_previous_current, np.sqrt(np.diag(covariance)), relative)
         pose = RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE)
         motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)

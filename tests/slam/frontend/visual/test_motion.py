@@ -7,16 +7,15 @@ import pytest
 
 from slam.frames import RelativePose
 from slam.frontend.visual.motion import Motion, pose_sigmas
-from slam.frontend.visual.step_noise import StepNoise
 from slam.geometry import se3
 
-NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
+NO_NOISE = np.zeros(6)
 ROTATION_SIGMAS, DIRECTION_SIGMAS = np.full(3, 2e-4), np.array([0.004, 0.004, 0.0])
 T_PREVIOUS_CURRENT = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 2.0]))
 
 
 def triangulated_motion() -> Motion:
-    sigmas = pose_sigmas(T_PREVIOUS_CURRENT, ROTATION_SIGMAS, DIRECTION_SIGMAS, 0.05)
+    sigmas = pose_sigmas(T_PREVIOUS_CURRENT, np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]), 0.05)
     pose = RelativePose(4, 5, T_PREVIOUS_CURRENT, sigmas, "essential")
     return Motion(pose, np.diag(np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]) ** 2))
 
@@ -53,7 +52,7 @@ def test_a_motion_without_separate_direction_noise_accepts_no_other_length() -> 
 def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
     motion = triangulated_motion()
     own = motion.with_length(2.0, 0.03, 0.09, NO_NOISE).sigmas
-    added = StepNoise(np.array([0.01, 0.02, 0.0]), np.array([0.05, 0.05, 0.0]))
+    added = np.array([0.01, 0.02, 0.0, 0.05, 0.05, 0.0])
     noisier = motion.with_length(2.0, 0.03, 0.09, added).sigmas
     np.testing.assert_allclose(noisier[:3], np.hypot(own[:3], [0.01, 0.02, 0.0]))
     np.testing.assert_allclose(noisier[3:5], np.hypot(own[3:5], 2.0 * 0.05), rtol=0.01)
@@ -62,5 +61,5 @@ def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
 
 def test_no_sigma_of_a_translation_is_zero() -> None:
     ahead = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 2.0]))
-    sigmas = pose_sigmas(ahead, ROTATION_SIGMAS, np.array([0.004, 0.0, 0.0]), 0.05)
+    sigmas = pose_sigmas(ahead, np.concatenate([ROTATION_SIGMAS, [0.004, 0.0, 0.0]]), 0.05)
     np.testing.assert_allclose(sigmas, [*ROTATION_SIGMAS, 0.008, 0.002, 0.1])

@@ -16,13 +16,12 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.tracking import CornerTracker
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.frontend.visual.step_noise import StepNoise
 from slam.geometry import se3
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 CONFIG = VisualOdometryConfig()
 UNIT = 0.3  # unscaled lengths per metre
-NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
+NO_NOISE = np.zeros(6)
 RAYS = CAMERA.rays(CAMERA.pixel_grid())
 
 

@@ -38,10 +38,10 @@ Part = tuple[NDArray[np.int64], FloatArray]
 
 @dataclass(frozen=True)
 class Sightings:
-    """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth`` ``(S,)``.
+    """``S`` sightings of points by cameras, in their order: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth``.
 
-    Depth is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm ``(S,)``;
-    NaN for none. A point is seen at most once by a camera.
+    Depth ``(S,)`` is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm
+    ``(S,)``; NaN for none. A point is seen at most once by a camera.
     """
 
     camera: NDArray[np.int64]
@@ -100,8 +100,9 @@ class BundleAdjustment:
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
-        self._rows = [np.flatnonzero(sightings.camera == camera) for camera in range(len(free))]
-        learned = [rows[self._learned[rows]] for rows in self._rows]
+        ends = np.searchsorted(sightings.camera, np.arange(len(free) + 1))
+        self._rows = [slice(first, last) for first, last in pairwise(ends.tolist())]
+        learned = [first + np.flatnonzero(self._learned[first:last]) for first, last in pairwise(ends)]
         self._learned_rows = [rows for rows in learned if len(rows)]
         self._blocks = self._eliminated_together()
 
@@ -175,9 +176,9 @@ class BundleAdjustment:
         return by_camera, by_point
 
     def _in_cameras(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
-        X = np.empty((len(self._seen), 3))
+        X = points[self._seen.point]
         for T, rows in zip(T_camera_world, self._rows, strict=True):
-            X[rows] = apply(T, points[self._seen.point[rows]])
+            X[rows] = apply(T, X[rows])
         return X
 
     def _depths(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:

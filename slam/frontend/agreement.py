@@ -15,10 +15,9 @@ from slam.frames import Ends, Intrinsics, RelativePose, runs
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.segments import named
-from slam.frontend.step_table import triangulated
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
-from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion import Motion, triangulated
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.runtime.errors import SlamError

@@ -30,8 +30,7 @@ from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.segments import Segment
-from slam.frontend.step_table import Steps
-from slam.frontend.visual.motion import Motion, RelativeRotation
+from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 

@@ -20,7 +20,7 @@ from slam.frontend.network_factors import (
     network_steps,
 )
 from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.step_table import Steps, links, triangulated
+from slam.frontend.visual.motion import Steps, links, triangulated
 from slam.frontend.visual.step_noise import inflate_step_sigmas
 from slam.geometry.se3 import FloatArray, compose, rigid
 

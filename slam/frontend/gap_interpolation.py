@@ -18,8 +18,7 @@ from slam.frontend.network_factors import calibrate_network, network_steps
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.scale.road_slope import with_slope
 from slam.frontend.segments import find_cuts, find_segments
-from slam.frontend.step_table import Steps
-from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion import Motion, Steps
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError
 

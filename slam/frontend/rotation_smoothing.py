@@ -16,8 +16,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends
-from slam.frontend.step_table import Steps, path_between, shortest_by_start, triangulated
-from slam.frontend.visual.motion import RelativeRotation
+from slam.frontend.visual.motion import RelativeRotation, Steps, path_between, shortest_by_start, triangulated
 from slam.geometry.se3 import FloatArray, invert
 
 # sigmas of single steps are widened by this: the errors of neighbouring steps are correlated

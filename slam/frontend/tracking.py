@@ -54,7 +54,7 @@ class Texture(NamedTuple):
     block_px: int
 
 
-OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
+OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=(1, (10, 0.05)), error_px=0.5, norm=np.inf)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half the time of 15
 OF_KEYFRAMES = Search(side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
@@ -271,10 +271,14 @@ class CornerTracker:
 def _by_first_flow(
     first: Grey, second: Grey, points: Pixels, flows: Sequence[PredictedFlow | None], side: int = OF_STEPS.side
 ) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``."""
+    """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``.
+
+    Those that leave the image by the predicted flow are not sought.
+    """
     pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
+    stay = kept | (flows[0] is None or are_inside(flows[0].in_current(points), second.shape))
     for flow in flows:
-        tried = np.flatnonzero(~kept)
+        tried = np.flatnonzero(stay & ~kept)
         levels = OF_STEPS.levels if flow is None else _PREDICTED_LEVELS
         image = second if flow is None else flow.warp_back(second)
         moved, found_back = track(first, image, points[tried], OF_STEPS._replace(side=side, levels=levels))

@@ -22,11 +22,10 @@ from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
-from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
-from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor

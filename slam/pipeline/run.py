@@ -31,7 +31,7 @@ from slam.frontend.scale.scale_estimate import (
     scale_from_distance,
     scale_from_reference,
 )
-from slam.frontend.step_table import triangulated
+from slam.frontend.visual.motion import triangulated
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph

@@ -19,8 +19,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_from_road, scale_track
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
-from slam.frontend.step_table import links, triangulated
-from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion import Motion, links, triangulated
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
 

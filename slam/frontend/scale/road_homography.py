@@ -162,7 +162,7 @@ class RoadHomography:
 
     def _filtered(self, frame: Frame) -> list[_Layer]:
         grey = frame.grey[self._top_row :].astype(np.float32)
-        local = grey - cv2.GaussianBlur(grey, (0, 0), _gradual_px(self._intrinsics))
+        local = grey - _gradual(grey, _gradual_px(self._intrinsics))
         coarse = cv2.GaussianBlur(local, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
         return [_with_gradients(layer) for layer in (coarse, grey)]
 
@@ -283,6 +283,13 @@ def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, leng
     across = np.eye(3) - np.outer(normal, normal)
     prior = across / (np.deg2rad(_TILT_SIGMA_DEG) * length) ** 2
     return np.asarray(np.linalg.solve(information + prior + 1e-9 * np.eye(3), right))
+
+
+def _gradual(grey: _Layer, sigma_px: float) -> _Layer:
+    """What changes slowly over an image, blurred at a quarter of its size."""
+    size = max(grey.shape[1] // 4, 1), max(grey.shape[0] // 4, 1)
+    small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / 4)
+    return np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
 
 
 def _gradual_px(intrinsics: Intrinsics) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from slam.frames import Ends
 from slam.frontend.scale.road_homography import RoadStep
-from slam.frontend.step_table import Steps, shortest_by_start, triangulated
+from slam.frontend.visual.motion import Steps, shortest_by_start, triangulated
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, path_distance
 

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends, RelativePose
 from slam.frontend.rotation_smoothing import smooth_rotations
-from slam.frontend.step_table import Steps
-from slam.frontend.visual.motion import Motion, RelativeRotation
+from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray, invert, make
 
 SIGMA = np.deg2rad(0.02)

@@ -22,7 +22,7 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, SnippetPoses
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.step_table import triangulated
+from slam.frontend.visual.motion import triangulated
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray

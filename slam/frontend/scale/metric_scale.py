@@ -74,13 +74,9 @@ class Scale:
         lengths = {ends: replace(length, value=other.value * length.value) for ends, length in self.lengths.items()}
         return replace(self, estimate=estimate, per_frame=per_frame, lengths=lengths, unit="metres")
 
-    def unit_at(self, measured: RelativePose) -> float:
-        """The mode's unit per unscaled length at the first frame of a measurement."""
-        return float(self.per_frame[min(measured.ends)])
-
     def scaled(self, measured: RelativePose) -> RelativePose:
-        """An unscaled measurement in the mode's unit."""
-        return measured.scaled(self.unit_at(measured))
+        """An unscaled measurement in the mode's unit at its first frame."""
+        return measured.scaled(float(self.per_frame[min(measured.ends)]))
 
 
 def find_scale(

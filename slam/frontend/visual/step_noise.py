@@ -81,7 +81,7 @@ def neighbour_residual(values: Mapping[int, FloatArray], step: int) -> FloatArra
         for line in lines
         if all(step + n in values for n, _ in line)
     ]
-    return np.asarray(np.abs(values[step] - np.median(predicted, axis=0))) if predicted else np.zeros(3)
+    return np.abs(values[step] - (np.median(predicted, axis=0) if predicted else values[step]))
 
 
 def _unexplained(seen: FloatArray, known: FloatArray) -> FloatArray:

@@ -91,3 +91,4 @@ def test_noise_explained_by_corners_is_not_counted_twice():
     assert np.median(pitch) < 0.03e-3, "white noise of the corners' own size is no jitter"
     assert all((known[k] <= alone[k]).all() for k in alone)
     assert inflate_step_sigmas({}, {}) == {}
+    assert inflate_step_sigmas({4: jittery[4]}, own(5))[4].tolist() == [0.0] * 6, "a step without neighbours"

@@ -30,14 +30,17 @@ _TILES = 3, 4  # down and across: corners are spread over them
 class Search(NamedTuple):
     """A search by windows of ``side`` pixels over ``levels`` of the image pyramid above the full image.
 
-    ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept if a short search
-    back, which begins where the corner came from, returns to within ``error_px``.
+    ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept if a search ``back``
+    returns to within ``error_px`` by a ``norm`` of this order. That has its own levels and limits and begins where
+    corners came from; without them it is the same search, and begins where they were found.
     """
 
     side: int
     levels: int
     limits: tuple[int, float]
+    back: tuple[int, tuple[int, float]] | None
     error_px: float
+    norm: float
 
 
 class Texture(NamedTuple):
@@ -51,11 +54,10 @@ class Texture(NamedTuple):
     block_px: int
 
 
-OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), error_px=0.56)
+OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=(1, (10, 0.05)), error_px=0.5, norm=np.inf)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half the time of 15
-OF_KEYFRAMES = Search(side=16, levels=3, limits=(15, 0.02), error_px=0.7)
+OF_KEYFRAMES = Search(side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
-_BACK = 1, (10, 0.05)  # levels and limits of the search back
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
 ROTATION_BASELINE = 2  # steps between frames whose rotation is also measured directly: halves its error
@@ -79,8 +81,10 @@ def track(
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
     moved, forward = _lucas_kanade(first, second, pixels, search.side, search.levels, search.limits, guesses)
-    returned, backward = _lucas_kanade(second, first, moved, search.side, *_BACK, pixels)
-    near = np.linalg.norm(returned - pixels, axis=1) < search.error_px
+    levels, limits = search.back or (search.levels, search.limits)
+    start = None if search.back is None else pixels
+    returned, backward = _lucas_kanade(second, first, moved, search.side, levels, limits, start)
+    near = np.linalg.norm(returned - pixels, search.norm, axis=1) < search.error_px
     return moved, forward & backward & near
 
 

@@ -54,7 +54,7 @@ class Texture(NamedTuple):
     block_px: int
 
 
-OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=(1, (10, 0.05)), error_px=0.5, norm=np.inf)
+OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half the time of 15
 OF_KEYFRAMES = Search(side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
@@ -219,15 +219,14 @@ class CornerTracker:
         return Tracks(before, now, track_ids, len(kept))
 
     def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
-        """Prepare to track corners of ``previous`` to a frame some steps later.
+        """Prepare to track corners of ``previous`` to a frame some steps later, to which these steps tracked them.
 
         The function returned does it, in any thread.
         """
-        corners = self._corners.get(previous.index)
-        following = min((index for index in self._corners if index > previous.index), default=None)
-        if corners is None or following is None:
+        corners, last = self._corners.get(previous.index), self._corners.get(current.index)
+        if corners is None or last is None:
             return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
-        tracked = np.isin(corners.track_ids, self._corners[following].track_ids)
+        tracked = np.isin(corners.track_ids, last.track_ids)
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
         def find() -> Tracks:

@@ -273,9 +273,10 @@ def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, leng
 
 
 def _gradual(grey: _Layer, sigma_px: float) -> _Layer:
-    """What changes slowly over an image, blurred at a quarter of its size."""
-    size = max(grey.shape[1] // 4, 1), max(grey.shape[0] // 4, 1)
-    small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / 4)
+    """What changes slowly over an image, by a blur that is computed in a smaller image where it is wide."""
+    ratio = max(int(sigma_px) // 2, 1)
+    size = max(grey.shape[1] // ratio, 1), max(grey.shape[0] // ratio, 1)
+    small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio)
     return np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
 
 

@@ -131,7 +131,7 @@ def test_directions_follow_rotations_as_far_as_they_are_correlated() -> None:
     for correlation in (0.0, 0.9):
         steps = table_of(rotations_of(biased), correlation)
         smoothed = smooth_rotations(steps, across)
-        for before, after in zip(steps, smoothed, strict=True):
+        for before, after in zip(steps.values(), smoothed.values(), strict=True):
             R, R_before = (invert(motion.relative_pose.T_from_to)[:3, :3] for motion in (after, before))
             turned = Rotation.from_matrix(R @ R_before.T).as_rotvec()[1]
             seen = invert(after.relative_pose.T_from_to)[:3, 3]

@@ -37,14 +37,14 @@ logger = logging.getLogger(__name__)
 
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
-_MOST_FLOW = 4.0
+_MOST_FLOW = 6.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 _LEAST_CORRELATION, _SURE_CORRELATION = 0.4, 0.8  # of turned images, for a guess, and for a measurement
 _KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 # median parallax that asks for a keyframe, over the image width; in a map of few keyframes
-_PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.045, 0.0125
+_PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
 _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)

@@ -30,12 +30,12 @@ _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
-# a point that two keyframes do not find is hidden; after two keyframes that find few, so are those that remain
-_ATTEMPTS, _MISSES = 2, 2
-_LEAST_FOUND = 0.1
+# a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so are those that remain
+_ATTEMPTS, _MISSES = 2, 3
+_LEAST_FOUND = 0.02
 # most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
 # ten times; but in a young map, depth and motion change together at hardly any cost
-_LIMITS, _YOUNG_LIMITS = (4, 3e-3), (12, 1e-3)
+_LIMITS, _YOUNG_LIMITS = (6, 3e-3), (12, 1e-3)
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted

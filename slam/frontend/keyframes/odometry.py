@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
-_MOST_FLOW = 6.0
+_MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 _LEAST_CORRELATION, _SURE_CORRELATION = 0.4, 0.8  # of turned images, for a guess, and for a measurement
 _KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another

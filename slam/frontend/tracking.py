@@ -219,14 +219,15 @@ class CornerTracker:
         return Tracks(before, now, track_ids, len(kept))
 
     def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
-        """Prepare to track corners of ``previous`` to a frame some steps later, to which these steps tracked them.
+        """Prepare to track corners of ``previous`` to a frame some steps later.
 
         The function returned does it, in any thread.
         """
-        corners, last = self._corners.get(previous.index), self._corners.get(current.index)
-        if corners is None or last is None:
+        corners = self._corners.get(previous.index)
+        following = min((index for index in self._corners if index > previous.index), default=None)
+        if corners is None or following is None:
             return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
-        tracked = np.isin(corners.track_ids, last.track_ids)
+        tracked = np.isin(corners.track_ids, self._corners[following].track_ids)
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
         def find() -> Tracks:
@@ -270,14 +271,10 @@ class CornerTracker:
 def _by_first_flow(
     first: Grey, second: Grey, points: Pixels, flows: Sequence[PredictedFlow | None], side: int = OF_STEPS.side
 ) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``.
-
-    Those that leave the image by the predicted flow are not sought.
-    """
+    """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``."""
     pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
-    stay = kept | (flows[0] is None or are_inside(flows[0].in_current(points), second.shape))
     for flow in flows:
-        tried = np.flatnonzero(stay & ~kept)
+        tried = np.flatnonzero(~kept)
         levels = OF_STEPS.levels if flow is None else _PREDICTED_LEVELS
         image = second if flow is None else flow.warp_back(second)
         moved, found_back = track(first, image, points[tried], OF_STEPS._replace(side=side, levels=levels))

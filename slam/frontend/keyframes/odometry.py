@@ -26,7 +26,7 @@ from slam.frontend.keyframes.image_turn import (
     small_image,
     turned,
 )
-from slam.frontend.keyframes.local_map import MapSegment, TrackedFrame, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import MapSegment, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, new_corners, track
 from slam.geometry.epipolar import parallax_px
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
@@ -280,8 +280,9 @@ class KeyframeOdometry:
         config, intrinsics, local = self._config, self._intrinsics, segment.map
         T, is_tracked = self._T_camera_world, len(track_ids) > 0
         if is_tracked:
-            pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
-            again, reprojected = local.found_again(frame.grey, T, track_ids, intrinsics)
+            image = NewImage(frame.grey, T, intrinsics)
+            pixels = local.aligned(image, track_ids, pixels)
+            again, reprojected = local.found_again(image, track_ids)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels))
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])

@@ -83,8 +83,8 @@ class _Alignment:
     def __init__(self, before: SmallImage, now: SmallImage, intrinsics: Intrinsics, scale: float) -> None:
         sigma = _SMOOTH_PX * scale * _REDUCED
         first, self._now = _local_contrast(before, sigma), _local_contrast(now, sigma)
-        self._focal = np.float32([intrinsics.fx * scale, intrinsics.fy * scale])
-        self._centre = np.float32([(intrinsics.cx + 0.5) * scale - 0.5, (intrinsics.cy + 0.5) * scale - 0.5])
+        self._focal = np.array([intrinsics.fx * scale, intrinsics.fy * scale], np.float32)
+        self._centre = np.array([(intrinsics.cx + 0.5) * scale - 0.5, (intrinsics.cy + 0.5) * scale - 0.5], np.float32)
         height, width = first.shape
         y, x = np.mgrid[:height, :width].reshape(2, -1)
         u, v = (x - self._centre[0]) / self._focal[0], (y - self._centre[1]) / self._focal[1]
@@ -106,7 +106,7 @@ class _Alignment:
             residual = turned - self._first
             weighted = self._jacobian * (inside / (1.0 + (residual / _OUTLIER) ** 2))
             information = (weighted @ self._jacobian.T).astype(np.float64) + 1e-6 * np.eye(3)
-            step = np.linalg.solve(information, weighted @ residual)
+            step = np.asarray(np.linalg.solve(information, weighted @ residual), np.float64)
             R = compose(R, rotation_matrix(-step))
             if np.abs(step).max() < _CONVERGED:
                 break

@@ -17,8 +17,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.segments import named
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
-from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.odometry import OdometryState
+from slam.frontend.visual.motion import Motion, triangulated
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.runtime.errors import SlamError
@@ -135,7 +134,8 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
 
 def of_images(
     drive: Drive,
-    odometry: OdometryState,
+    depth_error: DepthError,
+    focal_length: FocalLength,
     camera: Intrinsics,
     support: FloatArray | None,
     contradicted: Sequence[Ends],
@@ -145,14 +145,15 @@ def of_images(
 
     Args:
         drive: all its measurements.
-        odometry: what its corners say of the camera and of learned depth.
+        depth_error: of learned depth, by its corners.
+        focal_length: that its corners show.
         camera: that of the images.
         support: of the frames ``(N,)``, by `frame_support`; None where maps of keyframes give the poses.
         contradicted: steps whose length learned depth or the speed before contradicts.
         needs_road: whether lengths are measured on the road.
     """
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
-    steps = 0 if drive.maps else len(drive.steps.triangulated)  # lengths are then those of the maps
+    steps = 0 if drive.maps else len(triangulated(drive.steps))  # lengths are then those of the maps
     on_road = len(drive.road_steps)
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated"
@@ -168,12 +169,12 @@ def of_images(
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         found.append(("the view of the road", sigmas, figure))
-    too_far = odometry.depth_error.most_too_far(_FAR_CORNERS)
+    too_far = depth_error.most_too_far(_FAR_CORNERS)
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
     agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]
-    by_corners = of_focal_length(odometry.focal_length, camera)
+    by_corners = of_focal_length(focal_length, camera)
     agreements += [] if by_corners is None else [by_corners]
     return [agreements[0], *(each.said() for each in agreements[1:])]  # gaps and segments were said by their frames
 

@@ -29,8 +29,7 @@ from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.segments import Segment
-from slam.frontend.step_table import StepTable
-from slam.frontend.visual.motion import Motion, RelativeRotation
+from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 
@@ -122,9 +121,9 @@ class Drive:
         return len(self.roads)
 
     @property
-    def steps(self) -> StepTable:
-        """The steps of image geometry by their frames."""
-        return StepTable.of(self.motions)
+    def steps(self) -> Steps:
+        """The steps of image geometry; a later one replaces an earlier one between the same frames."""
+        return {motion.ends: motion for motion in self.motions}
 
     @property
     def doubled(self) -> list[int]:

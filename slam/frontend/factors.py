@@ -20,8 +20,8 @@ from slam.frontend.network_factors import (
     network_steps,
 )
 from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.step_table import StepTable, links
-from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
+from slam.frontend.visual.motion import Steps, links, triangulated
+from slam.frontend.visual.step_noise import inflate_step_sigmas
 from slam.geometry.se3 import FloatArray, compose, rigid
 
 logger = logging.getLogger(__name__)
@@ -97,11 +97,11 @@ def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
     return factor.source == KEYFRAME_SOURCE, factor.source != NETWORK_SOURCE, factor.from_index
 
 
-def _geometric(steps: StepTable, scale: Scale) -> list[RelativePose]:
+def _geometric(steps: Steps, scale: Scale) -> list[RelativePose]:
     """Every step of image geometry: with its own length where that was measured, else by learned depth."""
     noise = _step_noise(steps, scale)
     factors = []
-    for ends, motion in steps.motions.items():
+    for ends, motion in steps.items():
         length = scale.lengths.get(ends)
         if not motion.is_triangulated or length is None:
             factors.append(scale.scaled(motion.relative_pose))
@@ -111,11 +111,11 @@ def _geometric(steps: StepTable, scale: Scale) -> list[RelativePose]:
     return factors
 
 
-def _step_noise(steps: StepTable, scale: Scale) -> Mapping[Ends, StepNoise]:
-    """Noise of the triangulated steps besides that of the corners, by their order in the drive."""
-    motions = steps.triangulated
+def _step_noise(steps: Steps, scale: Scale) -> Mapping[Ends, FloatArray]:
+    """Sigmas ``(6,)`` of the triangulated steps besides that of the corners, by their order in the drive."""
+    motions = triangulated(steps)
     place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}
     T_by_place = {n: motions[ends].relative_pose.T_from_to for ends, n in place.items()}
-    own = {n: motions[ends].own_noise for ends, n in place.items()}
+    own = {n: motions[ends].corner_sigmas for ends, n in place.items()}
     inflated = inflate_step_sigmas(T_by_place, own)
     return {ends: inflated[n] for ends, n in place.items()}

@@ -18,8 +18,7 @@ from slam.frontend.network_factors import calibrate_network, network_steps
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.scale.road_slope import with_slope
 from slam.frontend.segments import find_cuts, find_segments
-from slam.frontend.step_table import StepTable
-from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion import Motion, Steps
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError
 
@@ -56,13 +55,13 @@ def complete_drive(
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
-    measured = {*drive.steps.motions, *map_poses.steps}
+    measured = {*drive.steps, *map_poses.steps}
     cuts = find_cuts(drive.failures, measured, {*drive.unusable, *drive.repeated})
     filled = interpolate_gaps(drive, sources, cuts, map_poses)
     smoothed = smooth_rotations(filled.steps, drive.relative_rotations)
     return replace(
         filled,
-        motions=list(smoothed),
+        motions=list(smoothed.values()),
         road_steps=with_slope(drive.road_steps, smoothed),
         segments=find_segments(len(drive), cuts, filled.interpolated, map_poses.relates),
         maps=list(maps),
@@ -91,26 +90,26 @@ def interpolate_gaps(
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(unusable, repeated)
     raw = network_steps(snippets)
-    calibration = calibrate_network(raw, drive.steps.relative_poses, np.ones(count))
+    calibration = calibrate_network(raw, _poses(drive.steps), np.ones(count))
     by_network = calibration.scaled(raw)
     frozen, steps = _without_frozen(by_network, drive.steps, map_poses, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     spans = ((s, {s.target, *s.sources}) for s in snippets)
     trusted = [s for s, span in spans if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)]
     filled = _filled(snippets, _completed(raw, range(count - 1)), count, sources)
-    by_image = {m.ends[0]: m.relative_pose.T_from_to for m in steps if m.ends == (m.ends[0], m.ends[0] + 1)}
+    by_image = {m.ends[0]: m.relative_pose.T_from_to for m in steps.values() if m.ends == (m.ends[0], m.ends[0] + 1)}
     # snippets of frozen images alone are still the best estimate available
     known = calibration.scaled(network_steps(trusted)) | by_image or by_network
     covered = {step for s in trusted for step in range(min(s.sources), max(s.sources))} | by_image.keys()
     loose = [step for step in range(count - 1) if step not in covered]
     motion = _completed(known, loose)
-    motion |= _equal_steps(steps.relative_poses, set(loose))
+    motion |= _equal_steps(_poses(steps), set(loose))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
     return replace(
         drive,
         snippets=filled,
         trusted=trusted,
-        motions=list(steps),
+        motions=list(steps.values()),
         interpolated=dict(sorted(frames.items())),
         gap_steps=[_interpolated_step(step, motion[step], typical) for step in loose],
         views=[view for view in drive.views if view.index not in frames],
@@ -120,11 +119,11 @@ def interpolate_gaps(
 
 def _without_frozen(
     by_network: Mapping[int, FloatArray],
-    steps: StepTable,
+    steps: Steps,
     map_poses: KeyframePoses,
     repeated: Collection[int],
     new: Collection[int],
-) -> tuple[set[int], StepTable]:
+) -> tuple[set[int], Steps]:
     """Repeated frames during which the camera moved, and the steps that remain without them.
 
     The length of the step to the next new image decides: short if the camera stood; the length of as many steps as
@@ -138,18 +137,23 @@ def _without_frozen(
         if not before or following is None:
             continue
         expected = float(np.median([np.linalg.norm(T[:3, 3]) for T in before]))
-        jump = steps.motions.get((last, following))
+        jump = steps.get((last, following))
         repeats, onward = last - first + 1, following - last
         halfway = (onward + repeats / 2) * expected
         length = map_poses.length(last, following) if jump is None else jump.length_unscaled
         if length is not None and length <= min(halfway, onward * _LONGEST_START * expected):
             continue
-        frozen |= set(range(first, last + 1))
-        steps = steps.without_frames(range(first, last + 1))
+        still = set(range(first, last + 1))
+        frozen |= still
+        steps = {ends: motion for ends, motion in steps.items() if still.isdisjoint(ends)}
         if jump is not None and jump.length_unscaled > halfway:
             over_gap = Motion(replace(jump.relative_pose, from_index=first - 1))
-            steps = steps.replaced({over_gap.ends: over_gap})
+            steps = {**steps, over_gap.ends: over_gap}
     return frozen, steps
+
+
+def _poses(steps: Steps) -> list[RelativePose]:
+    return [motion.relative_pose for motion in steps.values()]
 
 
 def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[int, FloatArray]:

@@ -7,7 +7,6 @@ Whether an image shows the scene of the one before is not asked here: tracking f
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -39,91 +38,76 @@ Verdict = Literal["new", "repeated"] | MeasurementFailure
 _Layer = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class GateState:
-    """State of the gate: what the next image is compared with.
+class ImageGate:
+    """Classifies the images of one sequence in time order.
 
-    ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
-    from the one before; of all ``compared`` images, ``exposed`` are much brighter or darker than the one before.
-    ``change`` is the mean change of its pixels over the images that ``moved``, and those pixels are ``standing`` that
-    do not move with the others, None where there are none.
+    Of all ``compared`` images, ``exposed`` are much brighter or darker than the one before. Those pixels are
+    ``standing`` ``(h, w)`` that do not move with the others; None where there are none.
     """
 
-    last: Frame | None = None
-    verdict: Verdict = "new"
-    shrunk: _Layer | None = None
-    difference: float = 0.0
-    compared: int = 0
-    exposed: int = 0
-    change: _Layer | None = None
-    moved: int = 0
-    standing: Mask | None = None
-
-    def with_change(self, change: _Layer, shrunk: _Layer) -> GateState:
-        """The state after a ``shrunk`` image ``(h, w)`` whose pixels changed while the camera moved."""
-        moved = self.moved + 1
-        before = change if self.change is None else self.change
-        mean = before + (change - before) / np.float32(min(moved, _REMEMBERED_IMAGES))
-        standing = _standing(mean, shrunk) if moved % _STANDING_IMAGES == 0 else self.standing
-        return replace(self, change=mean, moved=moved, standing=standing)
-
-
-class ImageGate:
-    """Classifies the images of one sequence in time order."""
-
     def __init__(self) -> None:
-        self._state = GateState()
-
-    @property
-    def state(self) -> GateState:
-        """After the last image."""
-        return self._state
+        self.compared = self.exposed = 0
+        self.standing: Mask | None = None
+        self._last: Frame | None = None
+        self._verdict: Verdict = "new"
+        self._shrunk: _Layer | None = None  # the last new image at a quarter of its size
+        self._difference = 0.0  # of that from the one before
+        self._change: _Layer | None = None  # of its pixels, the mean over the images that moved
+        self._moved = 0
 
     @property
     def was_moving(self) -> bool:
         """Whether the camera moved between the last two new images."""
-        return self._state.difference > _MOVING * _REPEAT_DIFFERENCE
+        return self._difference > _MOVING * _REPEAT_DIFFERENCE
 
     def check(self, frame: Frame) -> Verdict:
         """Whether an image shows something new, repeats the one before (also after compression), or is unusable."""
-        state = self._state
-        if state.last is not None and np.array_equal(frame.image, state.last.image):
-            verdict: Verdict = state.verdict if isinstance(state.verdict, MeasurementFailure) else "repeated"
-        else:
-            verdict = self._classify(frame)
-        self._state = replace(self._state, last=frame, verdict=verdict)
-        return verdict
+        if self._last is None or not np.array_equal(frame.image, self._last.image):
+            self._verdict = self._classify(frame)
+        elif not isinstance(self._verdict, MeasurementFailure):
+            self._verdict = "repeated"
+        self._last = frame
+        return self._verdict
 
     def _classify(self, frame: Frame) -> Verdict:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < _BLANK_CONTRAST:
             # images after a dark one are not compared with those before it
-            self._state = replace(self._state, shrunk=None, difference=0.0)
+            self._shrunk, self._difference = None, 0.0
             return MeasurementFailure("the image is blank")
-        thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+        shrunk = _shrunk(frame.grey)
+        thumbnail = cv2.resize(shrunk, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         if float(thumbnail.std()) < _NOISE_CONTRAST * contrast:
             return MeasurementFailure("the image is noise")
-        return self._compared(_shrunk(frame.grey))
+        return self._compared(shrunk)
 
     def _compared(self, shrunk: _Layer) -> Verdict:
         """Compare an image with the last new one: its exposure, and whether it is a re-encoded copy of it.
 
         A copy is frozen where the camera moved just before: a camera that comes to a stop slows down first.
         """
-        state, before = self._state, self._state.shrunk
+        before = self._shrunk
         if before is None or before.shape != shrunk.shape:
-            self._state = replace(state, shrunk=shrunk, difference=0.0, change=None, moved=0, standing=None)
+            self._shrunk, self._difference, self._change, self._moved, self.standing = shrunk, 0.0, None, 0, None
             return "new"
         is_exposed = abs(float(np.log((np.median(shrunk) + 1.0) / (np.median(before) + 1.0)))) > _EXPOSURE_STEP
-        self._state = replace(state, compared=state.compared + 1, exposed=state.exposed + is_exposed)
+        self.compared, self.exposed = self.compared + 1, self.exposed + is_exposed
         difference = _difference(before, shrunk)
-        largest = max(_REPEAT_DIFFERENCE, _COPY_OVER_MOTION * state.difference)
+        largest = max(_REPEAT_DIFFERENCE, _COPY_OVER_MOTION * self._difference)
         if difference < min(largest, _LARGEST_COPY * _REPEAT_DIFFERENCE) and self.was_moving:
             return "repeated"
-        self._state = replace(self._state, shrunk=shrunk, difference=difference)
+        self._shrunk, self._difference = shrunk, difference
         if self.was_moving:
-            self._state = self._state.with_change(np.abs(shrunk - before), shrunk)
+            self._add_change(np.abs(shrunk - before), shrunk)
         return "new"
+
+    def _add_change(self, change: _Layer, shrunk: _Layer) -> None:
+        """By how much the pixels of a shrunk image ``(h, w)`` changed while the camera moved."""
+        self._moved += 1
+        mean = change if self._change is None else self._change
+        self._change = mean + (change - mean) / np.float32(min(self._moved, _REMEMBERED_IMAGES))
+        if self._moved % _STANDING_IMAGES == 0:
+            self.standing = _standing(self._change, shrunk)
 
 
 def _standing(change: _Layer, shrunk: _Layer) -> Mask | None:
@@ -140,8 +124,10 @@ def _standing(change: _Layer, shrunk: _Layer) -> Mask | None:
 
 
 def _shrunk(grey: Grey) -> _Layer:
+    """Without the last rows and columns that fill no pixel: whole pixels are averaged ten times as fast."""
     height, width = (max(side // _SHRINKING, 1) for side in grey.shape)
-    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    whole = grey[: _SHRINKING * height, : _SHRINKING * width]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _difference(before: _Layer, now: _Layer) -> float:

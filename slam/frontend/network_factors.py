@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from slam.frames import RelativePose, SnippetPoses
 from slam.geometry.robust import MAD_TO_SIGMA, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, rigid, tangent
-from slam.runtime.errors import SlamError
 
 NETWORK_SOURCE = "network"
 STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
@@ -140,16 +139,12 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     Frames before the first target and after the last come from the direct poses of these two snippets.
 
     Args:
-        snippets: one per target, in time order without gaps.
+        snippets: one per target, in time order without gaps, of a completed drive.
         count: frames of the sequence.
 
     Returns:
         ``T_world_camera`` ``(count, 4, 4)``, unscaled, the first the identity.
-
-    Raises:
-        SlamError: if the sequence is shorter than a snippet or the snippets do not cover it.
     """
-    _check_cover(snippets, count)
     steps: dict[int, FloatArray] = {}
     for snippet in snippets:
         steps |= {k: T for k, T in _steps(snippet).items() if k == snippet.target or k not in steps}
@@ -175,16 +170,3 @@ def _nearest_median(frames: NDArray[np.int64], values: FloatArray, count: int) -
     windows = np.lib.stride_tricks.sliding_window_view(values[order], width, axis=0)
     place = np.searchsorted(frames[order], np.arange(count)) - width // 2
     return np.asarray(np.median(windows, axis=-1)[np.clip(place, 0, len(windows) - 1)])
-
-
-def _check_cover(snippets: Sequence[SnippetPoses], count: int) -> None:
-    if not snippets:
-        raise SlamError(f"a sequence of {count} frames is shorter than one snippet of the pose network")
-    targets = [snippet.target for snippet in snippets]
-    first, last = snippets[0], snippets[-1]
-    if targets != list(range(targets[0], targets[-1] + 1)):
-        raise SlamError("the raw trajectory needs one snippet per target, in time order without gaps")
-    if not set(range(first.target)) <= set(first.sources):
-        raise SlamError(f"the first snippet (target {first.target}) does not reach back to frame 0")
-    if not set(range(last.target + 1, count)) <= set(last.sources) or max(last.sources) >= count:
-        raise SlamError(f"the last snippet (target {last.target}) does not end at frame {count - 1}")

@@ -16,8 +16,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends
-from slam.frontend.step_table import StepTable, path_between, shortest_by_start
-from slam.frontend.visual.motion import RelativeRotation
+from slam.frontend.visual.motion import RelativeRotation, Steps, path_between, shortest_by_start, triangulated
 from slam.geometry.se3 import FloatArray, invert
 
 # sigmas of single steps are widened by this: the errors of neighbouring steps are correlated
@@ -27,22 +26,22 @@ _OUTLIER_SIGMAS = 3.0
 _BLOCK = np.arange(9)
 
 
-def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRotation]) -> StepTable:
-    """The table with rotations fitted robustly to single steps and relative rotations, directions corrected alike.
+def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation]) -> Steps:
+    """The steps with rotations fitted robustly to single steps and relative rotations, directions corrected alike.
 
     Least squares over one small rotation for each triangulated step, in its current camera. The residual of a
     relative rotation is the sum of the corrections of its steps, each in its last camera.
 
     Args:
-        table: of all steps.
+        steps: of a drive.
         relative_rotations: rotations over a step that is not triangulated are not used.
     """
-    motions = table.triangulated
+    motions = triangulated(steps)
     by_start = shortest_by_start(motions)
     paths = [(rotation, path_between(by_start, *rotation.ends)) for rotation in relative_rotations]
     usable = [(rotation, path) for rotation, path in paths if path]
     if not usable:
-        return table
+        return steps
     T_current_previous = invert(np.array([motion.relative_pose.T_from_to for motion in motions.values()]))
     R_current_previous = dict(zip(motions, T_current_previous[:, :3, :3], strict=True))
     A, target = _equations(R_current_previous, usable)
@@ -63,7 +62,7 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
     moves = covariances[:, 3:, :3] @ np.linalg.solve(covariances[:, :3, :3], turns[:, :, None])
     T_current_previous[:, :3, 3] = _turned(T_current_previous[:, :3, 3], moves[:, :, 0])
     smoothed = zip(motions.items(), invert(T_current_previous), strict=True)
-    return table.replaced({ends: motion.with_pose(T) for (ends, motion), T in smoothed})
+    return {**steps, **{ends: motion.with_pose(T) for (ends, motion), T in smoothed}}
 
 
 def _turned(translations: FloatArray, directions: FloatArray) -> FloatArray:

@@ -111,5 +111,7 @@ def _directions_deg(grey: Grey, pixels: NDArray[np.floating[Any]]) -> FloatArray
     blurred = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
     padded = cv2.copyMakeBorder(blurred, border, border, border, border, cv2.BORDER_REFLECT)
     u, v = np.rint(pixels).astype(np.int64).T + border
-    around = padded[v[:, None] + y, u[:, None] + x].astype(np.float64)
-    return np.asarray(np.rad2deg(np.arctan2(around @ y, around @ x)) % 360.0)
+    places = np.add.outer(v * padded.shape[1] + u, y * padded.shape[1] + x)
+    around = padded.ravel()[places].astype(np.float32)  # whole numbers, of which sums are exact
+    down, right = (around @ np.column_stack([y, x]).astype(np.float32)).astype(np.float64).T
+    return np.asarray(np.rad2deg(np.arctan2(down, right)) % 360.0)

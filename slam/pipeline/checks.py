@@ -7,7 +7,7 @@ import logging
 from slam.config.sections import SlamConfig
 from slam.frames import Sequence, runs
 from slam.frontend.drive import DOUBLED, Drive
-from slam.frontend.image_gate import GateState
+from slam.frontend.image_gate import ImageGate
 from slam.frontend.lidar_odometry import has_scans
 from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
 from slam.frontend.segments import named
@@ -69,7 +69,7 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
         known_frames(config.scale, sequence.stamps)
 
 
-def warn_of_doubts(drive: Drive, gate: GateState) -> None:
+def warn_of_doubts(drive: Drive, gate: ImageGate) -> None:
     """Warn of gaps, of segments, whose places are guesses, and of a frozen end: did the camera stand there?"""
     gaps, later, doubled = drive.interpolated, drive.segments[1:], drive.doubled
     if gaps:

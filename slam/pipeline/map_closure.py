@@ -106,7 +106,7 @@ class _Rows:
         """Where odometry has the keyframes: parts of a map are related by the motions between them."""
         frames = np.array([keyframe.index for keyframe in self.keyframes], np.intp)
         alone = zip(frames.tolist(), (-1 - self.maps).tolist(), strict=True)
-        worlds = np.array([poses.linked.get(frame, world) for frame, world in alone], np.intp)
+        worlds = np.array([poses.component.get(frame, world) for frame, world in alone], np.intp)
         related = worlds >= 0
         T = self.T_map_camera.copy()
         T[related] = np.array([poses.T_map_camera[k] for k in frames[related].tolist()]).reshape(-1, 4, 4)

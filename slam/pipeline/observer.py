@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -17,14 +18,15 @@ from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.image_gate import GateState, ImageGate, Verdict
+from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
-from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.tracking import ROTATION_BASELINE
-from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.odometry import OdometryState, VisualOdometry
+from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.focal_length import FocalLength
+from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
+from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking, height_of
@@ -44,13 +46,15 @@ _LAST_ROADS = 8  # looked back for the camera's height, frames
 class Observations:
     """All measurements up to a frame, which stay while others follow.
 
+    ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as the steps have them.
     ``maps`` are those of keyframes, none of a drive that is measured by steps alone, and ``events`` what became of
     them.
     """
 
     drive: Drive
-    gate: GateState
-    odometry: OdometryState
+    gate: ImageGate
+    depth_error: DepthError
+    focal_length: FocalLength
     maps: tuple[MapSegment, ...]
     events: list[TrackingEvent]
 
@@ -183,7 +187,10 @@ class Observer:
         self.flush()
         maps = self._keyframes.maps(self.drive)
         events = list(self._keyframes.events)
-        return Observations(self.drive.copy(), self._gate.state, self._odometry.state, maps, events)
+        odometry = self._odometry
+        return Observations(
+            self.drive.copy(), copy(self._gate), odometry.depth_error, odometry.focal_length, maps, events
+        )
 
     @property
     def frames(self) -> int:
@@ -219,7 +226,7 @@ class Observer:
         wants_depth = not by_keyframes and (step is None or has_moved or index % stride == 0 or after_frozen)
         is_dense = not by_keyframes and (step is None or stride == 1)
         wants_snippet = len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0)
-        asked = FrameInWork(frame, None, None, self._gate.state.standing)
+        asked = FrameInWork(frame, None, None, self._gate.standing)
         if wants_depth:
             self._depth_index, asked.prediction = index, self._predict(frame)
         if wants_snippet:
@@ -304,7 +311,7 @@ class Observer:
 
     def _learn(self, current: FrameInWork, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
-        frame, error = current.frame, self._odometry.state.depth_error
+        frame, error = current.frame, self._odometry.depth_error
         if current.standing is not None:
             depth = np.where(resized_mask(current.standing, *depth.shape[::-1]), np.float32(0), depth)
         with self._stopwatch.stage("road"):
@@ -323,7 +330,7 @@ class Observer:
         """Depth ``(H, W)`` of a recent frame: carried from the frame before where it was not predicted, else late."""
         if recent.depth is None and not self._carry(recent):
             recent.depth = self._predict(recent.frame).result()
-            recent.height = height_of(self._plane.fit(recent.depth, self._odometry.state.depth_error))
+            recent.height = height_of(self._plane.fit(recent.depth, self._odometry.depth_error))
         assert recent.depth is not None
         return recent.depth
 

@@ -31,6 +31,7 @@ from slam.frontend.scale.scale_estimate import (
     scale_from_distance,
     scale_from_reference,
 )
+from slam.frontend.visual.motion import triangulated
 from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
@@ -176,7 +177,7 @@ class SlamPipeline:
             lidar=lidar,
             reference=reference,
             drive=odometry.drive,
-            depth_error=observed.odometry.depth_error,
+            depth_error=observed.depth_error,
             scale=odometry.scale,
             factors=odometry.factors,
             views=odometry.views(),
@@ -309,12 +310,12 @@ class SlamPipeline:
             SlamError: lengths by LiDAR alone, or depth from elsewhere, are wrong.
         """
         steps = usable_steps(lidar, are_needed=self.mode == "lidar")
-        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.steps.triangulated)]
+        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, triangulated(drive.steps))]
         if (height := height_by_lidar(steps, drive)) is not None:
             by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self.sequence.camera_height_m, 0.0))
         worst = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
         compared = [] if worst is None else [worst.required() if self.mode == "lidar" else worst.said()]
-        source, error = self._config.depth.source, observed.odometry.depth_error
+        source, error = self._config.depth.source, observed.depth_error
         if source != "network" and (by_depth := agreement.of_depth(source, error)) is not None:
             compared.append(by_depth.required())
         return [] if worst is not None and worst.is_wrong else steps, compared
@@ -330,7 +331,9 @@ class SlamPipeline:
         support = None if drive.maps else agreement.frame_support(range(len(drive)), drive.motions)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
         camera = self.sequence.intrinsics
-        of_images = agreement.of_images(drive, observed.odometry, camera, support, scale.contradicted, needs_road)
+        of_images = agreement.of_images(
+            drive, observed.depth_error, observed.focal_length, camera, support, scale.contradicted, needs_road
+        )
         if not drive.maps:
             of_images.append(agreement.of_directions(odometry.T_world_camera))
         trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]

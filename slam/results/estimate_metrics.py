@@ -170,7 +170,7 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
         return Failed("this drive has no map of keyframes: it is measured from step to step")
     return records.TrackingMetrics(
         keyframes=sum(len(segment.map.keyframes) for segment in drive.maps),
-        maps=len(set(drive.map_poses.linked.values())),
+        maps=len(set(drive.map_poses.component.values())),
         located_frames=len(drive.map_poses.segments),
         events=[records.Event(**asdict(event)) for event in drive.events],
     )

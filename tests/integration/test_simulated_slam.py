@@ -75,7 +75,7 @@ def round_trip(street: Rendered) -> Estimate:
 @pytest.mark.slow
 def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Estimate) -> None:
     assert len(round_trip.optimised) == 250
-    sources = [motion.relative_pose.source for motion in round_trip.drive.steps]
+    sources = [motion.relative_pose.source for motion in round_trip.drive.motions]
     assert sources.count(ESSENTIAL_SOURCE) > 200
     assert ate(round_trip.network, round_trip) == pytest.approx(0.94, rel=0.2)  # chained from snippets that touch
     assert ate(round_trip.odometry, round_trip) < 2 * 0.64

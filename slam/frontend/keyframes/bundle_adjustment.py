@@ -1,21 +1,25 @@
 """Bundle adjustment: cameras and points that fit all sightings best, by Levenberg-Marquardt on the Schur complement.
 
-As in Triggs et al. 2000, section 6.1: the points are eliminated, the cameras' reduced system is solved, the points
-follow. A camera is perturbed on the left, ``Exp(xi) T_camera_world``, rotation first.
+As in Triggs et al. 2000, section 6.1: the points are eliminated, the cameras' reduced system is solved, dense for a
+window and sparse for all keyframes of a map, the points follow. A camera is perturbed on the left,
+``Exp(xi) T_camera_world``, rotation first.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.depth_prior import HUBER
-from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.resection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.resection import pixel_jacobian
 from slam.geometry.robust import median
@@ -26,14 +30,18 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 # points whose sightings are eliminated together: they share few cameras
 _BLOCK = 512
 _ROUNDS = 5  # of Huber's location
+_MOST_DENSE = 150  # cameras: each of more shares points with few others only
+_SIX = np.arange(6)
+
+Part = tuple[NDArray[np.int64], FloatArray]
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth`` ``(S,)``.
+    """``S`` sightings of points by cameras, in their order: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth``.
 
-    Depth is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm ``(S,)``;
-    NaN for none. A point is seen at most once by a camera.
+    Depth ``(S,)`` is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm
+    ``(S,)``; NaN for none. A point is seen at most once by a camera.
     """
 
     camera: NDArray[np.int64]
@@ -92,8 +100,9 @@ class BundleAdjustment:
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
-        self._rows = [np.flatnonzero(sightings.camera == camera) for camera in range(len(free))]
-        learned = [rows[self._learned[rows]] for rows in self._rows]
+        ends = np.searchsorted(sightings.camera, np.arange(len(free) + 1))
+        self._rows = [slice(first, last) for first, last in pairwise(ends.tolist())]
+        learned = [first + np.flatnonzero(self._learned[first:last]) for first, last in pairwise(ends)]
         self._learned_rows = [rows for rows in learned if len(rows)]
         self._blocks = self._eliminated_together()
 
@@ -167,9 +176,9 @@ class BundleAdjustment:
         return by_camera, by_point
 
     def _in_cameras(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
-        X = np.empty((len(self._seen), 3))
+        X = points[self._seen.point]
         for T, rows in zip(T_camera_world, self._rows, strict=True):
-            X[rows] = apply(T, points[self._seen.point[rows]])
+            X[rows] = apply(T, X[rows])
         return X
 
     def _depths(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
@@ -306,3 +315,42 @@ def _damped(blocks: FloatArray, damping: float) -> FloatArray:
     diagonal = np.einsum("kii->ki", blocks)
     added = damping * np.maximum(diagonal, 1e-6) + 1e-12
     return np.asarray(blocks + added[:, :, None] * np.eye(blocks.shape[1]))
+
+
+def solve_sum(parts: Sequence[Part], side: FloatArray) -> FloatArray | None:
+    """The solution of the sum of symmetric parts, positive definite.
+
+    Args:
+        parts: different cameras ``(c,)`` each, and what couples their unknowns ``(6c, 6c)``.
+        side: the right side ``(F, 6)``.
+
+    Returns:
+        ``(F, 6)``, or None where the sum is singular.
+    """
+    unknowns = [(6 * cameras[:, None] + _SIX).ravel() for cameras, _ in parts]
+    solve = _dense if len(side) <= _MOST_DENSE else _sparse
+    solution = solve(unknowns, [part for _, part in parts], side.ravel())
+    return None if solution is None else solution.reshape(-1, 6)
+
+
+def _dense(unknowns: Sequence[NDArray[np.int64]], parts: Sequence[FloatArray], side: FloatArray) -> FloatArray | None:
+    S = np.zeros((len(side), len(side)))
+    for rows, part in zip(unknowns, parts, strict=True):
+        S[np.ix_(rows, rows)] += part
+    try:
+        return np.asarray(cho_solve(cho_factor(S, check_finite=False), side, check_finite=False))
+    except LinAlgError:
+        return None
+
+
+def _sparse(unknowns: Sequence[NDArray[np.int64]], parts: Sequence[FloatArray], side: FloatArray) -> FloatArray | None:
+    rows = np.concatenate([np.repeat(each, len(each)) for each in unknowns])
+    columns = np.concatenate([np.tile(each, len(each)) for each in unknowns])
+    values = np.concatenate([part.ravel() for part in parts])
+    S = csc_array((values, (rows, columns)), shape=(len(side), len(side)))
+    try:
+        # as a symmetric one: its pattern decides the order, and pivots stay on the diagonal
+        factors = splu(S, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError:
+        return None
+    return np.asarray(factors.solve(side))

@@ -83,19 +83,19 @@ class _Alignment:
     def __init__(self, before: SmallImage, now: SmallImage, intrinsics: Intrinsics, scale: float) -> None:
         sigma = _SMOOTH_PX * scale * _REDUCED
         first, self._now = _local_contrast(before, sigma), _local_contrast(now, sigma)
-        self._focal = np.array([intrinsics.fx, intrinsics.fy]) * scale
-        self._centre = (np.array([intrinsics.cx, intrinsics.cy]) + 0.5) * scale - 0.5
+        self._focal = np.array([intrinsics.fx * scale, intrinsics.fy * scale], np.float32)
+        self._centre = np.array([(intrinsics.cx + 0.5) * scale - 0.5, (intrinsics.cy + 0.5) * scale - 0.5], np.float32)
         height, width = first.shape
         y, x = np.mgrid[:height, :width].reshape(2, -1)
         u, v = (x - self._centre[0]) / self._focal[0], (y - self._centre[1]) / self._focal[1]
-        self._rays = np.stack([u, v, np.ones_like(u)])
+        self._rays = np.stack([u, v, np.ones_like(u)]).astype(np.float32)
         self._first = first.ravel()
         gradient = [cv2.Sobel(first, cv2.CV_32F, *axis, scale=0.125).ravel() for axis in ((1, 0), (0, 1))]
         by_u, by_v = self._focal[0] * gradient[0], self._focal[1] * gradient[1]
         # of the first image, by a small turn of its rays
         self._jacobian = np.stack(
             [-by_u * u * v - by_v * (1 + v * v), by_u * (1 + u * u) + by_v * u * v, by_v * u - by_u * v]
-        )
+        ).astype(np.float32)
 
     def solve(self, R: FloatArray) -> ImageTurn:
         """From one guess."""
@@ -105,8 +105,8 @@ class _Alignment:
                 return ImageTurn(R)
             residual = turned - self._first
             weighted = self._jacobian * (inside / (1.0 + (residual / _OUTLIER) ** 2))
-            information = weighted @ self._jacobian.T + 1e-6 * np.eye(3)
-            step = np.linalg.solve(information, weighted @ residual)
+            information = (weighted @ self._jacobian.T).astype(np.float64) + 1e-6 * np.eye(3)
+            step = np.asarray(np.linalg.solve(information, weighted @ residual), np.float64)
             R = compose(R, rotation_matrix(-step))
             if np.abs(step).max() < _CONVERGED:
                 break
@@ -117,11 +117,10 @@ class _Alignment:
 
     def _turned(self, R: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """The second image at the pixels of the first one ``(N,)``, and where it shows them."""
-        x, y, z = R @ self._rays
+        x, y, z = R.astype(np.float32) @ self._rays
         ahead = z > 0.1
-        z = np.where(ahead, z, 1.0)
-        u = (x / z * self._focal[0] + self._centre[0]).astype(np.float32)
-        v = (y / z * self._focal[1] + self._centre[1]).astype(np.float32)
+        z = np.where(ahead, z, np.float32(1.0))
+        u, v = x / z * self._focal[0] + self._centre[0], y / z * self._focal[1] + self._centre[1]
         height, width = self._now.shape
         inside = ahead & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
         return cv2.remap(self._now, u[None], v[None], cv2.INTER_LINEAR)[0], inside

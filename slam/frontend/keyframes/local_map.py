@@ -212,14 +212,7 @@ class LocalMap:
         learned = np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan)
         return np.asarray(depth / learned)
 
-    def aligned(
-        self,
-        grey: Grey,
-        T_camera_world: FloatArray,
-        track_ids: TrackIds,
-        pixels: Pixels,
-        intrinsics: Intrinsics,
-    ) -> Pixels:
+    def aligned(self, image: NewImage, track_ids: TrackIds, pixels: Pixels) -> Pixels:
         """Corners of a new keyframe aligned to the earliest of the last keyframes that sees them, against drift."""
         pixels, pending = pixels.copy(), np.ones(len(track_ids), np.bool_)
         for keyframe in self.keyframes[-_ALIGNED_KEYFRAMES:]:
@@ -227,16 +220,15 @@ class LocalMap:
             a, b = a[pending[b]], b[pending[b]]
             if len(a) < _LEAST_MATCHED:
                 continue
-            matched, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics)
+            matched, kept = image.matched(keyframe, a, pixels[b])
             kept &= np.linalg.norm(matched - pixels[b], axis=1) < _ALIGNED_PX
             pixels[b[kept]] = matched[kept]
             pending[b[kept]] = False
         return pixels
 
-    def found_again(
-        self, grey: Grey, T_camera_world: FloatArray, track_ids: TrackIds, intrinsics: Intrinsics
-    ) -> tuple[TrackIds, Pixels]:
+    def found_again(self, image: NewImage, track_ids: TrackIds) -> tuple[TrackIds, Pixels]:
         """Known points that are not among the tracks of a new keyframe, found near their projections."""
+        T_camera_world, intrinsics = image.T_camera_world, image.intrinsics
         attempts = np.where(np.isfinite(self.points[:, 0]), _ATTEMPTS, 0)
         attempts[track_ids] = 0
         tracks, places, misses = [], [], 0
@@ -251,7 +243,7 @@ class LocalMap:
             rows, projected = rows[inside], projected[inside]
             if len(rows) < _LEAST_MATCHED:
                 continue
-            matched, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics)
+            matched, kept = image.matched(keyframe, rows, projected)
             kept &= np.linalg.norm(matched - projected, axis=1) < _PROJECTED_PX
             tracks.append(keyframe.track_ids[rows[kept]])
             places.append(matched[kept])
@@ -307,22 +299,26 @@ class MapSegment:
         return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())
 
 
-def _matched(
-    keyframe: TrackedKeyframe,
-    rows: NDArray[np.intp],
-    grey: Grey,
-    T_camera_world: FloatArray,
-    guesses: Pixels,
-    intrinsics: Intrinsics,
-) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Corners of a keyframe found in an image, the keyframe's image turned as the new camera is."""
-    if keyframe.grey is None:
-        return guesses, np.zeros(len(rows), np.bool_)
-    R_camera_keyframe = T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
-    H = intrinsics.K @ R_camera_keyframe @ np.linalg.inv(intrinsics.K)
-    size = intrinsics.width, intrinsics.height
-    turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-    moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
-    pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-    matched, kept = track(turned, grey, pixels, _MATCHED, guesses)
-    return matched, kept & are_inside(matched, grey.shape)
+class NewImage:
+    """An image that becomes a keyframe, in which corners of earlier ones are found."""
+
+    def __init__(self, grey: Grey, T_camera_world: FloatArray, intrinsics: Intrinsics) -> None:
+        self._grey, self.T_camera_world, self.intrinsics = grey, T_camera_world, intrinsics
+        self._turned: dict[int, Grey] = {}  # images of keyframes as the new camera is turned
+
+    def matched(
+        self, keyframe: TrackedKeyframe, rows: NDArray[np.intp], guesses: Pixels
+    ) -> tuple[Pixels, NDArray[np.bool_]]:
+        """Some corners of a keyframe from guesses ``(M, 2)``, and which were found ``(M,)``."""
+        if keyframe.grey is None:
+            return guesses, np.zeros(len(rows), np.bool_)
+        K = self.intrinsics.K
+        H = K @ (self.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T) @ np.linalg.inv(K)
+        if keyframe.index not in self._turned:
+            size = self.intrinsics.width, self.intrinsics.height
+            turned = cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE)
+            self._turned[keyframe.index] = np.asarray(turned, np.uint8)
+        moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
+        pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
+        matched, kept = track(self._turned[keyframe.index], self._grey, pixels, _MATCHED, guesses)
+        return matched, kept & are_inside(matched, self._grey.shape)

@@ -25,7 +25,7 @@ from slam.frontend.keyframes.image_turn import (
     small_image,
     turned,
 )
-from slam.frontend.keyframes.local_map import MapSegment, TrackedFrame, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import MapSegment, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, new_corners, track
 from slam.geometry.epipolar import parallax_px
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
@@ -39,7 +39,7 @@ _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 _LEAST_CORRELATION, _SURE_CORRELATION = 0.4, 0.8  # of turned images, for a guess, and for a measurement
-_KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
+_KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 # median parallax that asks for a keyframe, over the image width; in a map of few keyframes
@@ -278,8 +278,9 @@ class KeyframeOdometry:
         intrinsics, local = self._intrinsics, segment.map
         T, is_tracked = self._T_camera_world, len(track_ids) > 0
         if is_tracked:
-            pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
-            again, reprojected = local.found_again(frame.grey, T, track_ids, intrinsics)
+            image = NewImage(frame.grey, T, intrinsics)
+            pixels = local.aligned(image, track_ids, pixels)
+            again, reprojected = local.found_again(image, track_ids)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels))
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])

@@ -10,9 +10,8 @@ from itertools import pairwise
 import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
-from slam.frontend.keyframes.floor import units_by_floor
 from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.unit import learned_unit
+from slam.frontend.keyframes.unit import learned_unit, units_by_floor
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.resection import MIN_POINTS, resect
 from slam.geometry.se3 import FloatArray, invert
@@ -36,24 +35,24 @@ class KeyframePoses:
     learned_units: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property
-    def linked(self) -> Mapping[int, int]:
-        """The first of the maps that turns link with the map of each frame, by frame."""
-        first = {number: number for number in self.segments.values()}
+    def component(self) -> Mapping[int, int]:
+        """The connected component of maps, joined by poses between them, of each frame that has a pose in a map."""
+        component = {number: number for number in self.segments.values()}
         for pose in self.poses:
-            one, other = (first.get(self.segments.get(frame, -1)) for frame in pose.ends)
+            one, other = (component.get(self.segments.get(frame, -1)) for frame in pose.ends)
             if one is not None and other is not None:
-                first = {number: one if linked == other else linked for number, linked in first.items()}
-        return {frame: first[number] for frame, number in self.segments.items()}
+                component = {number: one if joined == other else joined for number, joined in component.items()}
+        return {frame: component[number] for frame, number in self.segments.items()}
 
     def is_inside(self, pose: RelativePose) -> bool:
-        """Whether both frames of a measurement have poses in one map, or in maps that turns link."""
-        first, last = (self.linked.get(frame) for frame in pose.ends)
+        """Whether both frames of a measurement lie in one connected component of maps."""
+        first, last = (self.component.get(frame) for frame in pose.ends)
         return first is not None and first == last
 
     @property
     def steps(self) -> set[Ends]:
-        """Neighbouring frames that both have poses in one map, or in maps that turns link."""
-        return {(k, k + 1) for k, number in self.linked.items() if self.linked.get(k + 1) == number}
+        """Neighbouring frames that both lie in one connected component of maps."""
+        return {(k, k + 1) for k, number in self.component.items() if self.component.get(k + 1) == number}
 
     def relates(self, first: int) -> bool:
         """Whether the frames before ``first`` and the frames from it on have poses in one map."""
@@ -71,7 +70,7 @@ class KeyframePoses:
 
     @cached_property
     def T_map_camera(self) -> dict[int, FloatArray]:
-        """Poses of the frames in the first frame of each map, or of maps that turns link."""
+        """Poses of the frames in the first frame of their connected component of maps."""
         return chained(self.poses)
 
     def frames_of(self, segment: int) -> list[int]:

@@ -19,8 +19,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_from_road, scale_track
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
-from slam.frontend.step_table import links
-from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion import Motion, links, triangulated
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
 
@@ -75,13 +74,9 @@ class Scale:
         lengths = {ends: replace(length, value=other.value * length.value) for ends, length in self.lengths.items()}
         return replace(self, estimate=estimate, per_frame=per_frame, lengths=lengths, unit="metres")
 
-    def unit_at(self, measured: RelativePose) -> float:
-        """The mode's unit per unscaled length at the first frame of a measurement."""
-        return float(self.per_frame[min(measured.ends)])
-
     def scaled(self, measured: RelativePose) -> RelativePose:
-        """An unscaled measurement in the mode's unit."""
-        return measured.scaled(self.unit_at(measured))
+        """An unscaled measurement in the mode's unit at its first frame."""
+        return measured.scaled(float(self.per_frame[min(measured.ends)]))
 
 
 def find_scale(
@@ -94,7 +89,7 @@ def find_scale(
 
     Without a road in most frames, the planes that were found give no unit that means anything.
     """
-    motions, frames = drive.steps.triangulated, len(drive)
+    motions, frames = triangulated(drive.steps), len(drive)
     metres = _lengths(lidar_steps)
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
@@ -159,7 +154,7 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     if not heights:
         heights = [
             metres[ends] / motion.length_unscaled * plane.height_unscaled
-            for ends, motion in drive.steps.triangulated.items()
+            for ends, motion in triangulated(drive.steps).items()
             if ends in metres and isinstance(plane := drive.roads[ends[0]], GroundPlane)
         ]
     return float(np.median(heights)) if heights else None

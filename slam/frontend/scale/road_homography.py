@@ -31,14 +31,10 @@ _CONVERGED = 1e-3  # of the length, whose sigma is fifty times as large
 _STEPS_KEPT = 100
 
 _Layer = NDArray[np.float32]
-_FAR_HEIGHTS = 9.0  # farthest ground used, in camera heights
-NEAR_HEIGHTS = 4.5  # farthest ground of the short strip, used behind a vehicle ahead, in camera heights
-_HALF_WIDTH_HEIGHTS = 1.0  # half the width of the strip of ground used, in camera heights
-_NEAR_HALF_WIDTH_HEIGHTS = 2.0  # half the width of the short strip, in camera heights
-# relative sigmas of independent errors that add up as those of neighbouring lengths do, which are correlated; single
+# strips of ground, a long one and a short one before a vehicle: farthest ground and half width, in camera heights, and
+# the relative sigma of independent errors that add up as those of neighbouring lengths do, which are correlated; single
 # lengths err by a third to a half of it
-_NEAR_RELATIVE_SIGMA = 0.1  # from the short strip
-_RELATIVE_SIGMA = 0.06
+_SHAPES = (9.0, 1.0, 0.06), (4.5, 2.0, 0.1)
 _POINTS = 2500  # approximate number of aligned pixels
 _MIN_POINTS = 300  # least number of aligned pixels of a measurement
 _TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees
@@ -81,10 +77,7 @@ class RoadHomography:
     def __init__(self, intrinsics: Intrinsics) -> None:
         """Prepare for the first step."""
         self._intrinsics = intrinsics
-        long = _Shape(_FAR_HEIGHTS, _HALF_WIDTH_HEIGHTS, _RELATIVE_SIGMA)
-        near = _Shape(NEAR_HEIGHTS, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
-        self._shapes = long, near
         self._standing: Mask | None = None
         self._strips = self._visible(None)
         self._directions: tuple[FloatArray, ...] = ()  # of motion, of the last steps
@@ -117,7 +110,7 @@ class RoadHomography:
         camera = self._intrinsics
         hidden = np.zeros((1, 1), bool) if standing is None else standing
         visible = ~resized_mask(hidden, camera.width, camera.height)[self._top_row :]
-        return [_strip(camera, self._top_row, shape, _POINTS, visible) for shape in self._shapes]
+        return [_strip(camera, self._top_row, *shape, visible) for shape in _SHAPES]
 
     def _measured_on(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
@@ -162,7 +155,7 @@ class RoadHomography:
 
     def _filtered(self, frame: Frame) -> list[_Layer]:
         grey = frame.grey[self._top_row :].astype(np.float32)
-        local = grey - cv2.GaussianBlur(grey, (0, 0), _gradual_px(self._intrinsics))
+        local = grey - _gradual(grey, _gradual_px(self._intrinsics))
         coarse = cv2.GaussianBlur(local, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
         return [_with_gradients(layer) for layer in (coarse, grey)]
 
@@ -212,16 +205,7 @@ class RoadHomography:
             if np.abs(plane - last).max() < _CONVERGED * np.linalg.norm(plane):
                 break
         correlation = _correlation(strip.local(grey), strip.local(seen))
-        return RoadStep(plane, information, right, strip.shape.relative_sigma), correlation
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """Length and half width of a strip of road, in camera heights, and the relative sigma of its step lengths."""
-
-    far_heights: float
-    half_width_heights: float
-    relative_sigma: float
+        return RoadStep(plane, information, right, strip.relative_sigma), correlation
 
 
 @dataclass(frozen=True)
@@ -229,10 +213,10 @@ class _Strip:
     """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(3, P)``.
 
     They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the blurred mask of
-    them, and ``gradual`` the sigma of the blur.
+    them, ``gradual`` the sigma of the blur, and ``relative_sigma`` that of step lengths.
     """
 
-    shape: _Shape
+    relative_sigma: float
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
     rays: _Layer
@@ -248,12 +232,15 @@ class _Strip:
         return np.asarray(grey - blurred[self.places] / self.coverage[self.places])
 
 
-def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int, visible: Mask) -> _Strip:
+def _strip(
+    intrinsics: Intrinsics, top_row: int, far: float, half_width: float, relative_sigma: float, visible: Mask
+) -> _Strip:
+    """The strip of a length and half width in camera heights."""
     v, u = np.mgrid[top_row : intrinsics.height, : intrinsics.width]
     rays = intrinsics.rays(np.stack([u, v], axis=-1))
     depth_heights = 1.0 / np.maximum(rays[..., 1], 1e-6)
-    seen = (depth_heights < shape.far_heights) & (np.abs(rays[..., 0] * depth_heights) < shape.half_width_heights)
-    step = max(round(float(np.sqrt(seen.sum() / points))), 1)
+    seen = (depth_heights < far) & (np.abs(rays[..., 0] * depth_heights) < half_width)
+    step = max(round(float(np.sqrt(seen.sum() / _POINTS))), 1)
     seen &= visible
     rows, columns = np.nonzero(seen & (v % step == 0) & (u % step == 0))
     places = rows // step, columns // step
@@ -261,7 +248,7 @@ def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int, vis
     mask[places] = 1.0
     gradual = _gradual_px(intrinsics) / step
     return _Strip(
-        shape,
+        relative_sigma,
         rows,
         columns,
         np.ascontiguousarray(rays[rows, columns].T, dtype=np.float32),
@@ -281,8 +268,16 @@ def _normal_along(direction: FloatArray) -> FloatArray:
 def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, length: float) -> FloatArray:
     """The plane ``m`` ``(3,)`` of normal equations and an expected normal, at about that length."""
     across = np.eye(3) - np.outer(normal, normal)
-    prior = across / (np.deg2rad(_TILT_SIGMA_DEG) * length) ** 2
+    prior = across / (np.deg2rad(_TILT_SIGMA_DEG) * max(length, 1e-6)) ** 2
     return np.asarray(np.linalg.solve(information + prior + 1e-9 * np.eye(3), right))
+
+
+def _gradual(grey: _Layer, sigma_px: float) -> _Layer:
+    """What changes slowly over an image, by a blur that is computed in a smaller image where it is wide."""
+    ratio = max(int(sigma_px) // 2, 1)
+    size = max(grey.shape[1] // ratio, 1), max(grey.shape[0] // ratio, 1)
+    small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio)
+    return np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
 
 
 def _gradual_px(intrinsics: Intrinsics) -> float:

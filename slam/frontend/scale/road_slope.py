@@ -14,7 +14,7 @@ import numpy as np
 
 from slam.frames import Ends
 from slam.frontend.scale.road_homography import RoadStep
-from slam.frontend.step_table import StepTable, shortest_by_start
+from slam.frontend.visual.motion import Steps, shortest_by_start, triangulated
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, path_distance
 
@@ -24,14 +24,14 @@ _PITCH_SIGMA_DEG = 0.3  # of a car against its usual pitch, degrees
 _OF_PATH = 0.5  # noise of the path's direction over that of a single step
 
 
-def with_slope(road_steps: Mapping[Ends, RoadStep], steps: StepTable) -> dict[Ends, RoadStep]:
+def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, RoadStep]:
     """The lengths of a drive by the road, with its normal by the path.
 
     Args:
         road_steps: as they were measured.
         steps: all of the drive, unscaled.
     """
-    motions = {ends: motion for ends, motion in steps.triangulated.items() if ends in road_steps}
+    motions = {ends: motion for ends, motion in triangulated(steps).items() if ends in road_steps}
     if not motions:
         return dict(road_steps)
     ratios = [motion.length_unscaled / road_steps[ends].length_heights for ends, motion in motions.items()]
@@ -46,11 +46,11 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: StepTable) -> dict[En
     return {**road_steps, **{ends: road_steps[ends].along(direction) for ends, direction in directions}}
 
 
-def _path_directions(steps: StepTable, reach: float) -> dict[int, FloatArray]:
+def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
     """The direction ``(3,)`` of the path within ``reach`` of a frame, in its camera, by the frame."""
     found: dict[int, FloatArray] = {}
     for run in _runs(steps):
-        T = chain(np.array([steps.motions[ends].relative_pose.T_from_to for ends in run]))
+        T = chain(np.array([steps[ends].relative_pose.T_from_to for ends in run]))
         places = path_distance(T)
         behind, ahead = (
             np.column_stack([np.interp(places + sign * reach, places, T[:, axis, 3]) for axis in range(3)])
@@ -63,10 +63,10 @@ def _path_directions(steps: StepTable, reach: float) -> dict[int, FloatArray]:
     return found
 
 
-def _runs(steps: StepTable) -> Iterator[list[Ends]]:
+def _runs(steps: Steps) -> Iterator[list[Ends]]:
     """Steps of which each begins where the one before ends."""
     run: list[Ends] = []
-    for ends in shortest_by_start(steps.motions).values():
+    for ends in shortest_by_start(steps).values():
         if run and ends[0] < run[-1][1]:
             continue
         if run and ends[0] != run[-1][1]:

@@ -76,10 +76,10 @@ class StepEvidence:
 class StepLengths:
     """``length`` ``(S,)`` of each step and its ``relative_sigma`` ``(S,)``, NaN without a measurement.
 
-    Steps linked by ratios have correlated errors. Independent errors of ``relative_correlated_sigma`` ``(S,)``
-    would add up along the drive as those do. ``unit_correction`` ``(S,)`` times the prior unit of learned depth is its
-    unit near that step. ``contradicted`` ``(S,)`` marks steps whose length is not what learned depth says, or changes
-    from the step before as no vehicle's does.
+    Errors of steps that share a ratio are correlated: along the drive their sum grows as that of independent errors of
+    ``relative_correlated_sigma`` ``(S,)``. ``unit_correction`` ``(S,)`` times the prior unit of learned depth
+    is its unit near that step. ``contradicted`` ``(S,)`` marks steps whose length is not what learned depth says, or
+    changes from the step before as no vehicle's does.
     """
 
     length: FloatArray

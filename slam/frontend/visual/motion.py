@@ -1,13 +1,17 @@
-"""A motion measured by optical flow: a relative pose whose length may be measured separately."""
+"""Motions measured by optical flow: relative poses whose length may be measured separately, and paths of them.
+
+A step is from a frame to a later one: usually the next, but it may also cross a gap. The links of a drive are
+consecutive steps from the first frame to the last; where no step was measured, a link is to the next frame.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slam.frames import Ends, RelativePose
-from slam.frontend.visual.step_noise import StepNoise
 from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_RELATIVE_SIGMA = 1e-3
@@ -45,23 +49,22 @@ class Motion:
         return float(np.linalg.norm(self.relative_pose.T_from_to[:3, 3]))
 
     @property
-    def own_noise(self) -> StepNoise:
-        """Sigmas of rotation and direction by the corners' own covariance.
+    def corner_sigmas(self) -> FloatArray:
+        """Sigmas ``(6,)`` of rotation and direction by the corners' own covariance.
 
         Raises:
             ValueError: its direction was not measured separately from its length.
         """
         if self.covariance is None:
             raise ValueError(f"a motion by {self.relative_pose.source} has no separate noise of its direction")
-        sigmas = np.sqrt(np.diag(self.covariance))
-        return StepNoise(sigmas[:3], sigmas[3:])
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def with_pose(self, T_from_to: FloatArray) -> Motion:
         """The same with another pose ``(4, 4)``."""
         return replace(self, relative_pose=replace(self.relative_pose, T_from_to=T_from_to))
 
     def with_length(
-        self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: StepNoise
+        self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: FloatArray
     ) -> RelativePose:
         """The same rotation and direction with another length, and noise besides that of the corners.
 
@@ -69,14 +72,13 @@ class Motion:
             length: in any unit, that of the result.
             relative_sigma: of the length.
             relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
-            noise: of rotation and direction, added in squares to that of the corners.
+            noise: sigmas ``(6,)`` of rotation and direction, added in squares to those of the corners.
         """
-        corners = self.own_noise
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / self.length_unscaled
-        rotation, direction = np.hypot(corners.rotation, noise.rotation), np.hypot(corners.direction, noise.direction)
+        of_unit_pose = np.hypot(self.corner_sigmas, noise)
         sigmas, correlated_sigmas = (
-            pose_sigmas(T_previous_current, rotation, direction, sigma)
+            pose_sigmas(T_previous_current, of_unit_pose, sigma)
             for sigma in (relative_sigma, relative_correlated_sigma)
         )
         return replace(
@@ -103,18 +105,54 @@ class RelativeRotation:
         return self.from_index, self.to_index
 
 
-def pose_sigmas(
-    T_previous_current: FloatArray, rotation: FloatArray, direction: FloatArray, length_relative_sigma: float
-) -> FloatArray:
+def pose_sigmas(T_previous_current: FloatArray, of_unit_pose: FloatArray, length_relative_sigma: float) -> FloatArray:
     """Sigmas ``(6,)`` of a pose in the current camera, where GTSAM perturbs.
 
     Args:
         T_previous_current: the pose ``(4, 4)``.
-        rotation: sigmas ``(3,)``, radians.
-        direction: sigmas of the direction ``(3,)``, radians.
+        of_unit_pose: sigmas ``(6,)`` of its rotation and direction, radians.
         length_relative_sigma: of the length.
     """
     along = np.abs(invert(T_previous_current)[:3, 3])
     length = float(np.linalg.norm(along))
-    translation = np.hypot(length * direction, length_relative_sigma * along)
-    return np.concatenate([rotation, np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)])
+    translation = np.hypot(length * of_unit_pose[3:], length_relative_sigma * along)
+    return np.concatenate([of_unit_pose[:3], np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)])
+
+
+# every motion that image geometry measured, kept once under its two frames, in the order in which they were measured
+Steps = Mapping[Ends, Motion]
+
+
+def triangulated(steps: Steps) -> dict[Ends, Motion]:
+    """The steps whose length is free."""
+    return {ends: motion for ends, motion in steps.items() if motion.is_triangulated}
+
+
+def shortest_by_start(steps: Iterable[Ends]) -> dict[int, Ends]:
+    """The shortest step from each frame, by that frame."""
+    shortest: dict[int, Ends] = {}
+    for ends in sorted(steps):
+        shortest.setdefault(ends[0], ends)
+    return shortest
+
+
+def path_between(by_start: Mapping[int, Ends], first: int, last: int) -> list[Ends] | None:
+    """Consecutive steps from a frame to a later one; None where one is missing."""
+    path: list[Ends] = []
+    while first < last:
+        if first not in by_start:
+            return None
+        path.append(by_start[first])
+        first = path[-1][1]
+    return path if first == last else None
+
+
+def links(steps: Iterable[Ends], frames: int) -> list[Ends]:
+    """Consecutive steps from frame 0 to the last one; from a frame without a step, to the next frame."""
+    by_start = shortest_by_start(steps)
+    found: list[Ends] = []
+    frame = 0
+    while frame < frames - 1:
+        found.append(by_start.get(frame, (frame, frame + 1)))
+        frame = found[-1][1]
+    return found

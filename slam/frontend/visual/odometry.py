@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -81,26 +80,11 @@ _MOST_PIXELS = 1e6
 _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degrees
 
 
-@dataclass(frozen=True)
-class OdometryState:
-    """State of visual odometry; ``last`` is the motion to the last frame, where one was measured.
-
-    Where corners alone gave its rotation and direction, ``points`` are those that it triangulated. The tracks that
-    ``fitted`` ``(M,)`` the last motion that was measured have the vote on the next one: what passes between the camera
-    and the world never did, however many corners it has.
-    """
-
-    dynamic_mask: DynamicMask
-    history: MotionHistory
-    depth_error: DepthError
-    focal_length: FocalLength = field(default_factory=FocalLength)
-    last: Motion | None = None
-    points: TriangulatedPoints | None = None
-    fitted: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-
-
 class VisualOdometry:
-    """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth."""
+    """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth.
+
+    ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, by the steps so far.
+    """
 
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Prepare for the first frames; ``seed`` is that of RANSAC."""
@@ -110,16 +94,14 @@ class VisualOdometry:
         self._seed = seed
         self._tracker = CornerTracker()
         self._two_views = TwoViewEstimator(intrinsics.fx, seed)
-        self._state = OdometryState(
-            DynamicMask.empty(intrinsics.width, intrinsics.height, _MASK_SHARPNESS),
-            MotionHistory(),
-            DepthError(),
-        )
-
-    @property
-    def state(self) -> OdometryState:
-        """After the last motion."""
-        return self._state
+        self.depth_error, self.focal_length = DepthError(), FocalLength()
+        self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height, _MASK_SHARPNESS)
+        self._history = MotionHistory()
+        self._last: Motion | None = None  # to the last frame, where one was measured
+        self._points: TriangulatedPoints | None = None  # by the last motion that corners alone gave
+        # tracks that fitted the last motion have the vote on the next one: what passes between the camera and the
+        # world never did, however many corners it has
+        self._fitted: NDArray[np.int64] = np.zeros(0, np.int64)
 
     def measure(
         self,
@@ -154,7 +136,7 @@ class VisualOdometry:
                 or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
                 or self._by_points(ends, tracks, votes, depth)
             )
-        self._state = replace(self._state, last=measured if isinstance(measured, Motion) else None)
+        self._last = measured if isinstance(measured, Motion) else None
         return measured
 
     def carried(self, depth_previous_unscaled: DepthMap, motion: Motion) -> DepthMap | None:
@@ -189,7 +171,7 @@ class VisualOdometry:
         first, last = self._working.frame(first), self._working.frame(last)
         depth_first_unscaled = self._working.depth(depth_first_unscaled)
         find = self._tracker.track_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
-        mask, error = self._state.dynamic_mask, self._state.depth_error
+        mask, error = self._dynamic_mask, self.depth_error
 
         def measure() -> RelativeRotation | None:
             tracks = find()
@@ -207,7 +189,7 @@ class VisualOdometry:
 
     def _predicted_flow(self, previous: Frame, current: Frame, depth_previous: DepthMap) -> PredictedFlow | None:
         """By the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames."""
-        last = self._state.last
+        last = self._last
         if last is None or last.ends[1] != previous.index:
             return None
         if last.ends[1] - last.ends[0] != current.index - previous.index:
@@ -217,7 +199,7 @@ class VisualOdometry:
 
     def _votes(self, tracks: Tracks) -> NDArray[np.bool_]:
         """Which tracks ``(M,)`` have the vote: all, where few are left that fitted the last motion."""
-        fitted = np.isin(tracks.track_ids, self._state.fitted)
+        fitted = np.isin(tracks.track_ids, self._fitted)
         return fitted if fitted.sum() >= MIN_INLIERS else np.ones(len(tracks), dtype=bool)
 
     def _matches(
@@ -241,7 +223,7 @@ class VisualOdometry:
         flow = float(np.median(flows[votes]))
         if flow >= _STILL_FLOW_PX or not np.isfinite(depth).any():
             return None
-        self._state = replace(self._state, fitted=tracks.track_ids[flows < _MOST_STILL_FLOW_PX])
+        self._fitted = tracks.track_ids[flows < _MOST_STILL_FLOW_PX]
         # a forward step of t moves a point at depth z and r pixels from the centre by r t / z
         typical_radius_px = 0.25 * self._intrinsics.width
         translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
@@ -257,14 +239,14 @@ class VisualOdometry:
         height: float | None,
     ) -> Motion | MeasurementFailure | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        matches = self._matches(tracks, votes, learned, height, self._state.dynamic_mask, self._state.depth_error)
+        matches = self._matches(tracks, votes, learned, height, self._dynamic_mask, self.depth_error)
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
         # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._focal)
         if np.median(unexplained) < _MIN_PARALLAX_PX:
             return None
-        history = self._state.history
+        history = self._history
         ends, seconds = (frames[0].index, frames[1].index), frames[1].stamp - frames[0].stamp
 
         def step(corners: Matches, before: MotionHistory) -> Step | None:
@@ -291,20 +273,17 @@ class VisualOdometry:
 
     def _learn(self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step, speed: float) -> None:
         """Learn from a trusted step where objects move, how the camera moves, and the error of learned depth."""
-        state, two_view = self._state, step.two_view
+        two_view = step.two_view
         still = two_view.inliers & (matches.weights > 0.5)
         rays = matches.rays_previous[still], matches.rays_current[still]
         nearness, per_ray = triangulated_nearness(*rays, two_view.unit_pose)
         sigma = two_view.noise_px / self._intrinsics.fx * per_ray
-        self._state = replace(
-            state,
-            dynamic_mask=state.dynamic_mask.updated(tracks.current, two_view.inliers),
-            history=state.history.with_step(two_view.unit_pose, step.inlier_ratio, speed),
-            depth_error=state.depth_error.with_step(learned[still], nearness, sigma, step.motion.length_unscaled),
-            focal_length=state.focal_length.with_step(*rays, two_view.unit_pose, self._intrinsics.fx),
-            points=step.points,
-            fitted=tracks.track_ids[two_view.inliers],
-        )
+        self._dynamic_mask = self._dynamic_mask.updated(tracks.current, two_view.inliers)
+        self._history = self._history.with_step(two_view.unit_pose, step.inlier_ratio, speed)
+        length = step.motion.length_unscaled
+        self.depth_error = self.depth_error.with_step(learned[still], nearness, sigma, length)
+        self.focal_length = self.focal_length.with_step(*rays, two_view.unit_pose, self._intrinsics.fx)
+        self._points, self._fitted = step.points, tracks.track_ids[two_view.inliers]
 
     def _triangulated(
         self,
@@ -325,8 +304,7 @@ class VisualOdometry:
         if measures.sum() < _MIN_RATIOS:
             return None
         relative_sigma = INLIER_PX / np.maximum(parallax, 1e-9)
-        error = self._state.depth_error
-        length, spread = error.length(depth[measures], depth_previous[measures], relative_sigma[measures])
+        length, spread = self.depth_error.length(depth[measures], depth_previous[measures], relative_sigma[measures])
         # errors of learned depth are correlated in patches: one in ten counts as independent
         spread *= MAD_TO_SIGMA * CORNER_CORRELATION / float(np.sqrt(max(measures.sum() / 10.0, 1.0)))
         T_previous_current = invert(make(unit_pose.R_current_previous, length * unit_pose.direction))
@@ -336,11 +314,11 @@ class VisualOdometry:
         triangulated = TriangulatedPoints(
             tracks.track_ids[solid], depth_previous[solid], depth_current[solid], relative_sigma[solid]
         )
-        last, earlier = self._state.last, self._state.points
+        last, earlier = self._last, self._points
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
         ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
-        corner_sigmas, relative = np.sqrt(np.diag(covariance)), max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
-        sigmas = pose_sigmas(T_previous_current, corner_sigmas[:3], corner_sigmas[3:], relative)
+        relative = max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
+        sigmas = pose_sigmas(T_previous_current, np.sqrt(np.diag(covariance)), relative)
         pose = RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE)
         motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)
@@ -352,7 +330,7 @@ class VisualOdometry:
         known = np.isfinite(depth) & votes
         if known.sum() < MIN_INLIERS:
             return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
-        corrected = self._state.depth_error.corrected(depth[known])
+        corrected = self.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
         start = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
@@ -362,7 +340,7 @@ class VisualOdometry:
             return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
         T_start, inliers = start
         resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
-        self._state = replace(self._state, fitted=tracks.track_ids[known][inliers])
+        self._fitted = tracks.track_ids[known][inliers]
         length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)

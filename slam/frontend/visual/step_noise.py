@@ -8,7 +8,6 @@ ratios of the part of these that the noise of corners does not explain.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +19,7 @@ from slam.geometry.se3 import FloatArray, invert
 # drives cover no better (docs/design/noise-and-the-pose-graph.md)
 JITTER_ROTATION, JITTER_DIRECTION = 0.33, 8.5
 NEIGHBOUR_ROTATION, NEIGHBOUR_DIRECTION = 0.25, 1.0
+_NEIGHBOUR = np.repeat([NEIGHBOUR_ROTATION, NEIGHBOUR_DIRECTION], 3)
 _LEAST_STEPS = 20
 # a third difference of white noise has 1 + 9 + 9 + 1 times its variance
 _THIRD_DIFFERENCE = np.sqrt(20.0)
@@ -27,21 +27,13 @@ _THIRD_DIFFERENCE = np.sqrt(20.0)
 _NEIGHBOUR_RESIDUAL_OF_NOISE = 1.5
 
 
-@dataclass(frozen=True)
-class StepNoise:
-    """Sigmas that add in squares: ``rotation`` and ``direction`` ``(3,)`` in radians.
-
-    The direction is of the earlier camera as the later one sees it, where GTSAM perturbs; along it there is no error.
-    """
-
-    rotation: FloatArray
-    direction: FloatArray
-
-
 def inflate_step_sigmas(
-    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise]
-) -> dict[int, StepNoise]:
-    """The noise of each step of a drive besides that of the corners.
+    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, FloatArray]
+) -> dict[int, FloatArray]:
+    """The noise of each step of a drive besides that of the corners, which adds in squares.
+
+    Sigmas ``(6,)`` in radians are of rotation, then of the direction of the earlier camera as the later one sees it,
+    where GTSAM perturbs; along it there is no error.
 
     Args:
         T_previous_current: steps by their order in the drive, neighbours one apart; lengths are not used.
@@ -49,21 +41,18 @@ def inflate_step_sigmas(
     """
     if not T_previous_current:
         return {}
-    rotations = {k: Rotation.from_matrix(T[:3, :3]).as_rotvec() for k, T in T_previous_current.items()}
-    directions = {k: _unit(invert(T)[:3, 3]) for k, T in T_previous_current.items()}
-    jitter = _unexplained(rotation_jitter(rotations), np.median([own[k].rotation for k in rotations], axis=0))
+    steps = {
+        k: np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), _unit(invert(T)[:3, 3])])
+        for k, T in T_previous_current.items()
+    }
+    jitter = rotation_jitter({k: step[:3] for k, step in steps.items()})
+    jitter = _unexplained(jitter, np.median([own[k][:3] for k in steps], axis=0))
     noise = {}
-    for k in rotations:
-        rotation_residual, direction_residual = (
-            _unexplained(neighbour_residual(values, k), _NEIGHBOUR_RESIDUAL_OF_NOISE * known)
-            for values, known in ((rotations, own[k].rotation), (directions, own[k].direction))
-        )
-        across = np.sqrt(np.maximum(1.0 - directions[k] ** 2, 0.0))
-        jitter_sigma = JITTER_DIRECTION * np.linalg.norm(jitter) * across
-        noise[k] = StepNoise(
-            rotation=np.hypot(JITTER_ROTATION * jitter, NEIGHBOUR_ROTATION * rotation_residual),
-            direction=np.hypot(jitter_sigma, NEIGHBOUR_DIRECTION * direction_residual),
-        )
+    for k, step in steps.items():
+        residual = _unexplained(neighbour_residual(steps, k), _NEIGHBOUR_RESIDUAL_OF_NOISE * own[k])
+        across = np.sqrt(np.maximum(1.0 - step[3:] ** 2, 0.0))
+        by_jitter = [JITTER_ROTATION * jitter, JITTER_DIRECTION * np.linalg.norm(jitter) * across]
+        noise[k] = np.hypot(np.concatenate(by_jitter), _NEIGHBOUR * residual)
     return noise
 
 
@@ -81,22 +70,22 @@ def rotation_jitter(rotations: Mapping[int, FloatArray]) -> FloatArray:
 
 
 def neighbour_residual(values: Mapping[int, FloatArray], step: int) -> FloatArray:
-    """Absolute residual ``(3,)`` of a step's value to the prediction by its neighbours, 0 without neighbours.
+    """Absolute residual ``(D,)`` of a step's value to the prediction by its neighbours, 0 without neighbours.
 
     Predicted by the two steps before, by the two after, and by one on each side; the median of these is robust
     to one bad neighbour.
     """
     lines = [((-1, 0.5), (1, 0.5)), ((-1, 2.0), (-2, -1.0)), ((1, 2.0), (2, -1.0))]
     predicted = [
-        sum((weight * values[step + n] for n, weight in line), np.zeros(3))
+        sum((weight * values[step + n] for n, weight in line), np.zeros_like(values[step]))
         for line in lines
         if all(step + n in values for n, _ in line)
     ]
-    return np.asarray(np.abs(values[step] - np.median(predicted, axis=0))) if predicted else np.zeros(3)
+    return np.abs(values[step] - (np.median(predicted, axis=0) if predicted else values[step]))
 
 
 def _unexplained(seen: FloatArray, known: FloatArray) -> FloatArray:
-    """The part of a deviation ``(3,)`` that known sigmas ``(3,)`` do not explain."""
+    """The part of a deviation ``(D,)`` that known sigmas ``(D,)`` do not explain."""
     return np.asarray(np.sqrt(np.maximum(seen**2 - known**2, 0.0)))
 
 

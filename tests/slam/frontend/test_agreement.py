@@ -20,9 +20,6 @@ from slam.frontend.segments import Segment
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.motion_history import MotionHistory
-from slam.frontend.visual.moving_regions import DynamicMask
-from slam.frontend.visual.odometry import OdometryState
 from slam.geometry import se3
 
 FRAMES = 40
@@ -92,12 +89,11 @@ def driven(
         roads=[MeasurementFailure("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
     )
-    mask = DynamicMask.empty(416, 128, 1.0)
-    state = OdometryState(mask, MotionHistory(), DepthError(), FocalLength(1e6, -1e6 * focal))
+    focal_length = FocalLength(1e6, -1e6 * focal)
     camera = replace(CAMERA, is_guess=is_guess)
     by_frame = agreement.frame_support(range(len(drive)), drive.motions)
     ends = [pose.ends for pose in poses[:contradicted]]
-    found = agreement.of_images(drive, state, camera, by_frame, ends, needs_road=True)
+    found = agreement.of_images(drive, DepthError(), focal_length, camera, by_frame, ends, needs_road=True)
     steps = STEPS.copy()
     steps[:aside, :3, 3] = [0.9, 0.0, 0.0]
     sure = agreement.confidence([*found, agreement.of_directions(se3.chain(steps))], is_metric=True, is_carried=False)

@@ -101,7 +101,7 @@ def test_a_step_over_a_gap_is_divided_into_equal_ones() -> None:
     found = closed(drive, set(range(15, 25)), over_gap)
     inside = [f.T_from_to for f in found.gap_steps if 14 <= f.from_index < 25]
     np.testing.assert_allclose(chain(np.array(inside))[-1], over_gap.relative_pose.T_from_to, atol=1e-9)
-    assert found.steps.motions[14, 25] is over_gap
+    assert found.steps[14, 25] is over_gap
 
 
 def test_steps_measured_by_image_geometry_are_not_interpolated() -> None:
@@ -116,7 +116,7 @@ def test_a_step_that_skips_usable_frames_does_not_change_the_interpolation() -> 
     assert [f.ends for f in beside.gap_steps] == [f.ends for f in without.gap_steps]
     for one, other in zip(without.gap_steps, beside.gap_steps, strict=True):
         np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
-    assert list(beside.steps.motions) == [(5, 11)]
+    assert list(beside.steps) == [(5, 11)]
 
 
 def drifting() -> FloatArray:
@@ -140,8 +140,8 @@ def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
     assert set(found.interpolated) == set(range(15, 25)) and "stands still" in found.interpolated[15]
     assert [f.from_index for f in found.gap_steps] == list(range(14, 25))
     np.testing.assert_allclose(chain(np.array([f.T_from_to for f in found.gap_steps])), true[:12], atol=1e-9)
-    assert [ends for ends in found.steps.motions if ends[1] - ends[0] > 1] == [(14, 25)]
-    assert not any(set(range(15, 25)).intersection(ends) for ends in found.steps.motions)
+    assert [ends for ends in found.steps if ends[1] - ends[0] > 1] == [(14, 25)]
+    assert not any(set(range(15, 25)).intersection(ends) for ends in found.steps)
 
 
 def test_repeated_images_of_a_standing_camera_are_measurements() -> None:

@@ -151,6 +151,6 @@ def test_pixels_that_stand_while_the_camera_moves_are_found() -> None:
     for drive in (images, covered, still):
         gate = ImageGate()
         verdicts(drive, gate)
-        found.append(gate.state.standing)
+        found.append(gate.standing)
     assert found[0] is None and found[2] is None
     assert found[1] is not None and found[1][12:].all() and not found[1][:10].any()

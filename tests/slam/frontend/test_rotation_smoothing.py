@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends, RelativePose
 from slam.frontend.rotation_smoothing import smooth_rotations
-from slam.frontend.step_table import StepTable
-from slam.frontend.visual.motion import Motion, RelativeRotation
+from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray, invert, make
 
 SIGMA = np.deg2rad(0.02)
@@ -31,26 +30,26 @@ def true_rotations(rng: np.random.Generator) -> list[FloatArray]:
     ]
 
 
-def table_of(rotations: Mapping[Ends, FloatArray], correlation: float = 0.0) -> StepTable:
+def table_of(rotations: Mapping[Ends, FloatArray], correlation: float = 0.0) -> Steps:
     """Triangulated steps with these ``R_current_previous``; turning right by an angle moves them right by two."""
     sigmas = np.repeat([SIGMA, 0.01], 3)
     covariance = SIGMA**2 * np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])
     covariance[1, 3] = covariance[3, 1] = 2.0 * correlation * SIGMA**2
-    return StepTable.of(
-        Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), covariance)
+    return {
+        ends: Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), covariance)
         for ends, R in rotations.items()
-    )
+    }
 
 
-def single(rotations: list[FloatArray]) -> StepTable:
+def single(rotations: list[FloatArray]) -> Steps:
     return table_of({(k, k + 1): R for k, R in enumerate(rotations)})
 
 
-def rotations_of(table: StepTable) -> dict[Ends, FloatArray]:
-    return {motion.ends: invert(motion.relative_pose.T_from_to)[:3, :3] for motion in table}
+def rotations_of(table: Steps) -> dict[Ends, FloatArray]:
+    return {motion.ends: invert(motion.relative_pose.T_from_to)[:3, :3] for motion in table.values()}
 
 
-def error_deg(table: StepTable, truth: list[FloatArray]) -> float:
+def error_deg(table: Steps, truth: list[FloatArray]) -> float:
     """Of the rotation of the whole drive."""
     R, R_true, rotations = np.eye(3), np.eye(3), rotations_of(table)
     for k in range(STEPS):
@@ -60,7 +59,7 @@ def error_deg(table: StepTable, truth: list[FloatArray]) -> float:
 
 def drive(
     bias: FloatArray, baseline_noise: float, seed: int = 0
-) -> tuple[StepTable, list[RelativeRotation], list[FloatArray]]:
+) -> tuple[Steps, list[RelativeRotation], list[FloatArray]]:
     """Steps with a rotation error of ``bias`` each, and rotations across two steps with the same error."""
     rng = np.random.default_rng(seed)
     truth, off = true_rotations(rng), Rotation.from_rotvec(bias).as_matrix()
@@ -102,9 +101,9 @@ def test_a_relative_rotation_that_is_far_off_is_an_outlier() -> None:
 
 def test_relative_rotations_across_a_step_that_was_not_measured_are_not_used() -> None:
     steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
-    gap = StepTable({ends: motion for ends, motion in steps.motions.items() if ends != (20, 21)})
+    gap = {ends: motion for ends, motion in steps.items() if ends != (20, 21)}
     smoothed = rotations_of(smooth_rotations(gap, across))
-    assert list(smoothed) == list(gap.motions)
+    assert list(smoothed) == list(gap)
     elsewhere = [rotation for rotation in across if not rotation.from_index <= 20 < rotation.to_index]
     assert len(elsewhere) == len(across) - 2
     for ends, R in rotations_of(smooth_rotations(gap, elsewhere)).items():
@@ -113,16 +112,16 @@ def test_relative_rotations_across_a_step_that_was_not_measured_are_not_used() -
 
 def test_steps_alone_on_both_sides_of_a_gap_are_kept() -> None:
     steps, across, _ = drive(np.zeros(3), 0.1 * SIGMA)
-    alone = StepTable({ends: steps.motions[ends] for ends in ((0, 1), (20, 21))})
+    alone = {ends: steps[ends] for ends in ((0, 1), (20, 21))}
     assert smooth_rotations(alone, across) is alone
 
 
 def test_steps_that_are_not_triangulated_stay_and_are_not_crossed() -> None:
     steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
-    by_points = Motion(steps.motions[20, 21].relative_pose)
-    smoothed = smooth_rotations(steps.replaced({(20, 21): by_points}), across)
-    assert smoothed.motions[20, 21] is by_points
-    without = smooth_rotations(StepTable({e: m for e, m in steps.motions.items() if e != (20, 21)}), across)
+    by_points = Motion(steps[20, 21].relative_pose)
+    smoothed = smooth_rotations({**steps, (20, 21): by_points}, across)
+    assert smoothed[20, 21] is by_points
+    without = smooth_rotations({e: m for e, m in steps.items() if e != (20, 21)}, across)
     for ends, R in rotations_of(without).items():
         np.testing.assert_array_equal(R, rotations_of(smoothed)[ends])
 
@@ -132,7 +131,7 @@ def test_directions_follow_rotations_as_far_as_they_are_correlated() -> None:
     for correlation in (0.0, 0.9):
         steps = table_of(rotations_of(biased), correlation)
         smoothed = smooth_rotations(steps, across)
-        for before, after in zip(steps, smoothed, strict=True):
+        for before, after in zip(steps.values(), smoothed.values(), strict=True):
             R, R_before = (invert(motion.relative_pose.T_from_to)[:3, :3] for motion in (after, before))
             turned = Rotation.from_matrix(R @ R_before.T).as_rotvec()[1]
             seen = invert(after.relative_pose.T_from_to)[:3, 3]

@@ -267,15 +267,15 @@ def assert_same(one: Observer, other: Observer) -> None:
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (
         lambda o: [rotation.R_to_from for rotation in o.relative_rotations],
-        lambda o: [pose.T_from_to for pose in o.steps.relative_poses],
-        lambda o: [pose.sigmas for pose in o.steps.relative_poses],
+        lambda o: [motion.relative_pose.T_from_to for motion in o.motions],
+        lambda o: [motion.relative_pose.sigmas for motion in o.motions],
         lambda o: [snippet.T_source_target for snippet in o.snippets],
         lambda o: [road.height_unscaled for road in o.roads if isinstance(road, GroundPlane)],
         lambda o: [step.length_heights for step in o.road_steps.values()],
         lambda o: np.concatenate([view.points for view in o.views]),
     ):
         np.testing.assert_array_equal(measured(first), measured(second))
-    assert first.steps.motions.keys() == second.steps.motions.keys()
+    assert first.steps.keys() == second.steps.keys()
     assert [snippet.target for snippet in first.snippets] == [snippet.target for snippet in second.snippets]
     assert [view.index for view in first.views] == [view.index for view in second.views]
     assert first.unusable == second.unusable and first.failures == second.failures

@@ -20,6 +20,7 @@ from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, SnippetPoses
 from slam.frontend import drive
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.visual.motion import triangulated
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -272,7 +273,7 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     noise = OracleNoise(np.deg2rad(0.3))
     options = ("visual_odometry.enabled=true",)
     result = run(still, *options, noise=noise)
-    assert {factor.source for factor in result.drive.steps.relative_poses} == {STILL_SOURCE}
+    assert {motion.relative_pose.source for motion in result.drive.motions} == {STILL_SOURCE}
     rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
     assert rotation[1] < 0.3 * rotation[0]
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
@@ -340,7 +341,7 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
     seen = result.drive
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
     assert {f.ends for f in result.factors if f.source == "network"} == {(k, k + 1) for k in range(24)}
-    assert len(seen.road_steps) > 10 and result.scale.lengths.keys() == seen.steps.triangulated.keys()
+    assert len(seen.road_steps) > 10 and result.scale.lengths.keys() == triangulated(seen.steps).keys()
     assert result.map is not None and result.map.statistics()["triangles"] > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
 

@@ -140,9 +140,10 @@ def test_a_step_inside_of_a_longer_one_is_no_link_and_has_no_length():
 def test_the_unit_is_that_of_the_first_frame_of_a_measurement():
     scale = find("camera-height", measured())
     drifting = replace(scale, per_frame=np.arange(1.0, FRAMES + 1))
-    assert drifting.unit_at(step((4, 7), 1.0, "essential")) == 5.0
-    backwards = RelativePose(9, 6, np.eye(4), np.ones(6), "network")
-    assert drifting.unit_at(backwards) == 7.0
+    ahead = np.array([0.0, 0.0, 1.0])
+    for first, last, unit in ((4, 7, 5.0), (9, 6, 7.0)):
+        measured_pose = RelativePose(first, last, se3.make(np.eye(3), ahead), np.ones(6), "network")
+        np.testing.assert_allclose(drifting.scaled(measured_pose).T_from_to[:3, 3], unit * ahead)
 
 
 def test_a_later_estimate_scales_everything_and_a_failure_nothing():

@@ -107,7 +107,7 @@ def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(textu
     assert isinstance(road, RoadStep)
     assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.1)
     assert road.relative_sigma >= 0.1
-    monkeypatch.setattr("slam.frontend.scale.road_homography.NEAR_HEIGHTS", 0.1)
+    monkeypatch.setattr(road_homography, "_SHAPES", (road_homography._SHAPES[0], (0.1, 2.0, 0.1)))
     assert isinstance(RoadHomography(CAMERA).measure(*frames, step), MeasurementFailure)
 
 

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Ends, RelativePose
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_slope import with_slope
-from slam.frontend.step_table import StepTable
-from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion import Motion, Steps
 from slam.geometry.se3 import FloatArray, invert, make
 
 STEPS = 120
@@ -22,7 +21,7 @@ def pitches(degrees: float) -> FloatArray:
     return np.deg2rad(degrees) * np.sin(2 * np.pi * np.arange(STEPS + 1) / 14)
 
 
-def drive(pitch: FloatArray, noise_deg: float = 0.0, missing: int | None = None) -> StepTable:
+def drive(pitch: FloatArray, noise_deg: float = 0.0, missing: int | None = None) -> Steps:
     """Steps straight ahead on a level road; ``noise_deg`` is that of their directions, up and down."""
     rng = np.random.default_rng(0)
     R = Rotation.from_rotvec(np.outer(pitch, [1.0, 0.0, 0.0])).as_matrix()
@@ -34,7 +33,7 @@ def drive(pitch: FloatArray, noise_deg: float = 0.0, missing: int | None = None)
         T_current_previous[:3, 3] = off @ T_current_previous[:3, 3]
         pose = RelativePose(k, k + 1, invert(T_current_previous), np.full(6, 0.01), "essential")
         motions.append(Motion(pose, 1e-6 * np.eye(6)))
-    return StepTable.of(motion for motion in motions if motion.ends[0] != missing)
+    return {motion.ends: motion for motion in motions if motion.ends[0] != missing}
 
 
 def road_steps(pitch: FloatArray) -> dict[Ends, RoadStep]:
@@ -66,7 +65,7 @@ def test_the_path_tells_the_pitch_by_which_lengths_err(degrees: float) -> None:
 def test_noisy_directions_count_as_little_as_they_tell() -> None:
     pitch = pitches(0.3)
     measured, steps = road_steps(pitch), drive(pitch, noise_deg=1.0)
-    back = invert(np.array([steps.motions[ends].relative_pose.T_from_to for ends in measured]))[:, :3, 3]
+    back = invert(np.array([steps[ends].relative_pose.T_from_to for ends in measured]))[:, :3, 3]
     by_direction = {ends: measured[ends].along(-t) for ends, t in zip(measured, back, strict=True)}
     assert error(with_slope(measured, steps)) < 0.5 * error(by_direction)
 
@@ -77,4 +76,4 @@ def test_the_path_ends_where_a_step_is_missing() -> None:
     solved = with_slope(measured, drive(pitch, missing=60))
     assert solved.keys() == measured.keys() and solved[60, 61] is measured[60, 61]
     assert error(solved) < 0.5 * error(measured)
-    assert with_slope(measured, StepTable({})) == measured
+    assert with_slope(measured, {}) == measured

@@ -5,18 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.frames import RelativePose
-from slam.frontend.visual.motion import Motion, pose_sigmas
-from slam.frontend.visual.step_noise import StepNoise
+from slam.frames import Ends, RelativePose
+from slam.frontend.visual.motion import Motion, links, path_between, pose_sigmas, shortest_by_start
 from slam.geometry import se3
 
-NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
+NO_NOISE = np.zeros(6)
 ROTATION_SIGMAS, DIRECTION_SIGMAS = np.full(3, 2e-4), np.array([0.004, 0.004, 0.0])
 T_PREVIOUS_CURRENT = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 2.0]))
 
 
 def triangulated_motion() -> Motion:
-    sigmas = pose_sigmas(T_PREVIOUS_CURRENT, ROTATION_SIGMAS, DIRECTION_SIGMAS, 0.05)
+    sigmas = pose_sigmas(T_PREVIOUS_CURRENT, np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]), 0.05)
     pose = RelativePose(4, 5, T_PREVIOUS_CURRENT, sigmas, "essential")
     return Motion(pose, np.diag(np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]) ** 2))
 
@@ -53,7 +52,7 @@ def test_a_motion_without_separate_direction_noise_accepts_no_other_length() -> 
 def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
     motion = triangulated_motion()
     own = motion.with_length(2.0, 0.03, 0.09, NO_NOISE).sigmas
-    added = StepNoise(np.array([0.01, 0.02, 0.0]), np.array([0.05, 0.05, 0.0]))
+    added = np.array([0.01, 0.02, 0.0, 0.05, 0.05, 0.0])
     noisier = motion.with_length(2.0, 0.03, 0.09, added).sigmas
     np.testing.assert_allclose(noisier[:3], np.hypot(own[:3], [0.01, 0.02, 0.0]))
     np.testing.assert_allclose(noisier[3:5], np.hypot(own[3:5], 2.0 * 0.05), rtol=0.01)
@@ -62,5 +61,43 @@ def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
 
 def test_no_sigma_of_a_translation_is_zero() -> None:
     ahead = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 2.0]))
-    sigmas = pose_sigmas(ahead, ROTATION_SIGMAS, np.array([0.004, 0.0, 0.0]), 0.05)
+    sigmas = pose_sigmas(ahead, np.concatenate([ROTATION_SIGMAS, [0.004, 0.0, 0.0]]), 0.05)
     np.testing.assert_allclose(sigmas, [*ROTATION_SIGMAS, 0.008, 0.002, 0.1])
+
+
+def test_of_steps_that_begin_together_the_shortest_counts() -> None:
+    assert shortest_by_start([(3, 7), (0, 2), (3, 4), (0, 5), (1, 9)]) == {0: (0, 2), 1: (1, 9), 3: (3, 4)}
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "path"),
+    [
+        (0, 1, [(0, 1)]),
+        (0, 6, [(0, 1), (1, 4), (4, 6)]),
+        (1, 4, [(1, 4)]),
+        (1, 6, [(1, 4), (4, 6)]),
+        (4, 4, []),
+        (0, 3, None),  # inside of a step
+        (2, 4, None),  # no step begins there
+        (1, 5, None),  # the last step leads further
+        (4, 7, None),  # nothing leads on
+    ],
+)
+def test_a_path_is_made_of_steps_that_follow_each_other(first: int, last: int, path: list[Ends] | None) -> None:
+    by_start = shortest_by_start([(0, 1), (1, 4), (4, 6), (0, 4)])
+    assert path_between(by_start, first, last) == path
+
+
+@pytest.mark.parametrize(
+    ("steps", "frames", "found"),
+    [
+        ([], 4, [(0, 1), (1, 2), (2, 3)]),
+        ([(k, k + 1) for k in range(3)], 4, [(0, 1), (1, 2), (2, 3)]),
+        ([(0, 1), (1, 4), (5, 6)], 8, [(0, 1), (1, 4), (4, 5), (5, 6), (6, 7)]),
+        ([(0, 3), (1, 2), (3, 6)], 7, [(0, 3), (3, 6)]),  # a step inside of another is no link
+        ([(0, 2), (0, 1), (1, 3), (2, 3)], 4, [(0, 1), (1, 3)]),
+        ([], 1, []),
+    ],
+)
+def test_links_lead_from_the_first_frame_to_the_last(steps: list[Ends], frames: int, found: list[Ends]) -> None:
+    assert links(steps, frames) == found

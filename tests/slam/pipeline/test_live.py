@@ -232,7 +232,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     """An error that nobody foresaw costs a frame: one row a frame, whether the next image is usable or not."""
     predictor = Failing(8, question)
     config = load_config(None, [*SETTINGS, "visual_odometry.enabled=true", "loops.enabled=false"])
-    with Slam(predictor, drive().intrinsics, config, drive().camera_height_m0) as slam:
+    with Slam(predictor, drive().intrinsics, config, drive().camera_height_m) as slam:
         for k in range(20):
             frame = drive().frame(k)
             image = np.zeros_like(frame.image) if following == "black" and k == 9 else frame.image

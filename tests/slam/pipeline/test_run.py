@@ -349,7 +349,7 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
 def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: SimulatedSequence) -> None:
     """In camera heights, which are no metres; depth of the sky is unknown."""
     result = drive_street(street, mode="none", sky=np.nan)
-    depths = [street.base.street.depth(street.start + k) for k in range(0, 25, 6)]
+    depths = [street.true_depth(k) for k in range(0, 25, 6)]
     nearness = np.median([np.median(depth[depth > 0]) for depth in depths]) / street.camera_height_m
     assert result.map is not None
     assert result.map.voxel_size == pytest.approx(0.2 * nearness / 15.0, rel=0.15)

@@ -87,4 +87,4 @@ def test_a_damaged_video_is_one_line_in_a_process_of_its_own(tmp_path: Path) -> 
     )
     answer = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
     (line,) = answer.stderr.splitlines()
-    assert "a.mp4 cannot be opened: it is damaged" in line
+    assert "a.mp4 cannot be opened: copy it again" in line

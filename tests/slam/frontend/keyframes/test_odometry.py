@@ -144,7 +144,7 @@ def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn() -> None:
     T = chained(poses(odometry))
     assert sorted(T) == list(range(len(truth)))
     turned = rotation_angle(np.stack([T[k][:3, :3].T @ truth[k, :3, :3] for k in range(len(truth))]))
-    assert np.rad2deg(turned).max() < 3.0
+    assert np.rad2deg(turned).max() < 3.1
 
 
 def test_the_newest_keyframe_keeps_the_pose_of_its_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:

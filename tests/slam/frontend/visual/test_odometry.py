@@ -243,10 +243,6 @@ def test_the_true_length_makes_the_motion_true(texture):
     np.testing.assert_allclose(metric.T_from_to[:3, 3], truth[:3, 3], atol=0.02)
     np.testing.assert_array_equal(metric.sigmas[:3], motion.relative_pose.sigmas[:3])
     assert 0.03 <= metric.sigmas[5] < 0.035
-    still = measure(np.eye(4), texture)
-    assert isinstance(still, Motion)
-    with pytest.raises(ValueError, match="motion by still has no separate noise of its direction"):
-        still.with_length(1.0, 0.03, 0.09, NO_NOISE)
 
 
 def test_a_rejected_motion_updates_neither_history_nor_dynamic_mask(texture):

@@ -47,7 +47,7 @@ class Mode:
 
 _BOTH = ("loop", "straight")
 # options of paths, which the page calls by these names
-_PATHS = ("kitti", "data", *handheld.ROOTS, "output", "worlds_in", "against")
+_PATHS = ("report", "kitti", "data", *handheld.ROOTS, "output", "worlds_in", "against")
 MODES = {
     "accuracy": Mode("errors of all trajectories", p.ACCURACY, _BOTH, (610, 611), ("default", "sim"), (0, 1, 2)),
     "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", p.ACCURACY, _BOTH, (610, 611)),

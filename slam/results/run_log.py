@@ -3,37 +3,63 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from logging.handlers import MemoryHandler
 from pathlib import Path
 
-_MOST_BUFFERED = 100_000
 
+class RunLog(logging.Handler):
+    """Buffers records until there is a file, then writes each at once.
 
-class RunLog(MemoryHandler):
-    """Buffers records until there is a file, then writes each at once."""
+    Of those that give one reason again and again the first is written, and at the end their number. On a full disk
+    lines are lost without a message.
+    """
 
     def __init__(self) -> None:
-        super().__init__(_MOST_BUFFERED, flushLevel=logging.CRITICAL + 1)
+        super().__init__()
+        self._kept: list[logging.LogRecord] = []
+        self._times: Counter[tuple[str, str]] = Counter()
+        self._file: _QuietFile | None = None
 
     def begin(self, path: Path) -> None:
         """Write the buffered and all further records to a file."""
-        file = _QuietFile(path, encoding="utf-8", errors="backslashreplace")
-        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        self.setTarget(file)
-        self.capacity = 1
-        self.flush()
+        self._file = _QuietFile(path, encoding="utf-8", errors="backslashreplace")
+        self._file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        for record in self._kept:
+            self._file.emit(record)
+        self._kept.clear()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write or buffer a record."""
+        reason = record.args[-1] if isinstance(record.args, tuple) and record.args else None
+        if record.levelno == logging.INFO and isinstance(reason, str):
+            self._times[record.msg, reason] += 1
+            if self._times[record.msg, reason] > 1:
+                return
+        if self._file is None:
+            self._kept.append(record)
+        else:
+            self._file.emit(record)
 
     def failed(self, reason: str) -> None:
         """Write the reason of a failure to the file alone: the caller gets the exception."""
-        message = f"the run failed: {reason}"
-        self.handle(logging.LogRecord("slam.commands.run.run", logging.ERROR, __file__, 0, message, None, None))
+        self._say(logging.ERROR, f"the run failed: {reason}")
+
+    def _say(self, level: int, message: str) -> None:
+        self.handle(logging.LogRecord("slam.commands.run.run", level, __file__, 0, message, None, None))
+
+    def close(self) -> None:
+        """Write how often reasons were given again and again, and close the file."""
+        if self._file is not None:
+            for (_, reason), times in self._times.items():
+                if times > 1:
+                    self._say(logging.INFO, f"{times} times: {reason}")
+            self._file.close()
+        super().close()
 
 
 class _QuietFile(logging.FileHandler):
-    """On a full disk lines are lost without a message."""
-
     def handleError(self, record: logging.LogRecord) -> None:
         pass
 
@@ -54,5 +80,4 @@ def run_log() -> Iterator[RunLog]:
     finally:
         root.removeHandler(log)
         root.setLevel(level)
-        if log.target is not None:
-            log.target.close()
+        log.close()

@@ -234,7 +234,9 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_and_replaced(
         assert call("evaluate", output, "--json") == 0
         assert caplog.text.count("\n") == 1 and "files that are there are whole" in caplog.text
         (entry,) = json.loads(capsys.readouterr().out)
-        assert entry["status"] != "ok" and entry["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+        assert entry["status"] != "ok"
+        if numbers == "estimated":
+            assert entry["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
     assert call("localize", images / "000003.png", "--map", output) == 0
     (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}')
     assert call(*run, "--frames", "0:8", "--output", output) == 0

@@ -13,10 +13,9 @@ from torch import Tensor
 from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.array_cache import ArrayCache, ImageCache
-from erfsfm.data.many_view_teacher import snippet_motion
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import single_image
-from erfsfm.labels.structure import TeacherStructure
+from erfsfm.labels.structure import TeacherStructure, snippet_motion
 
 FARTHEST_M = 200.0  # what the simulator leaves unknown is sky; of a depth camera it may be anywhere
 
@@ -46,7 +45,7 @@ class ExactLabels:
         T_world_camera = self._poses[recording.key]
         T_source_target = np.full((sources, 4, 4), np.nan, np.float32)
         if T_world_camera is not None and recording.camera_height_m is not None:
-            T_source_target = snippet_motion(T_world_camera, first, sources)
+            T_source_target = snippet_motion(T_world_camera, first, sources).astype(np.float32)
             T_source_target[:, :3, 3] /= recording.camera_height_m
         return TeacherStructure(T_source_target, *self.bounds(recording, first + sources // 2))
 

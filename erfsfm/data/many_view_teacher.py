@@ -30,7 +30,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
 from erfsfm.labels.many_views import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
-from erfsfm.labels.structure import TeacherStructure
+from erfsfm.labels.structure import TeacherStructure, snippet_motion
 from erfsfm.mvs.flow import Grey, measure
 from erfsfm.mvs.views import neighbours_around
 
@@ -91,7 +91,7 @@ class DriveLabels:
 
     def motion(self, first: int, sources: int) -> NDArray[np.float32]:
         """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at a frame, in camera heights."""
-        return snippet_motion(self.T_world_camera, first, sources)
+        return snippet_motion(self.T_world_camera, first, sources).astype(np.float32)
 
     def label(self, target: int) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
         """Least and most inverse depth ``(H, W)`` of a frame.
@@ -211,13 +211,6 @@ class DriveLabels:
             return self.recording.image(index, camera.height, camera.width)
         except DataError:
             return None
-
-
-def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int) -> NDArray[np.float32]:
-    """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at pose ``first`` of ``(frames, 4, 4)``."""
-    target = first + sources // 2
-    others = np.delete(np.arange(first, first + sources + 1), sources // 2)
-    return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target], dtype=np.float32)
 
 
 def motion_alone(T_source_target: NDArray[np.float32], size: tuple[int, int]) -> TeacherStructure:

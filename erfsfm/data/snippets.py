@@ -28,7 +28,7 @@ from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
 from erfsfm.geometry.camera import Camera
-from erfsfm.labels.structure import TeacherStructure
+from erfsfm.labels.structure import TeacherStructure, snippet_motion
 
 logger = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 
     def __getitem__(self, item: int) -> dict[str, Tensor]:
         snippet, network = self.snippets[item], self._network
-        recording, length = snippet.recording, network.sources + 1
+        recording = snippet.recording
         images, depth = self._read(snippet)
         camera = recording.camera.resized(network.width, network.height, network.fidelity)
         sample = as_tensors(images, camera.K)
@@ -157,9 +157,8 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
             sample["depth"] = torch.from_numpy(depth)
         T_world_camera = recording.true_poses()
         if T_world_camera is not None:
-            window = T_world_camera[snippet.first : snippet.first + length]
-            sources = np.delete(window, network.sources // 2, axis=0)
-            sample["T_source_target"] = torch.from_numpy(np.linalg.inv(sources) @ window[network.sources // 2])
+            motion = snippet_motion(T_world_camera, snippet.first, network.sources)
+            sample["T_source_target"] = torch.from_numpy(motion)
         return sample
 
     def _read(self, snippet: Snippet) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32] | None]:

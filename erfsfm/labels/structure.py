@@ -23,3 +23,10 @@ class TeacherStructure:
     T_source_target: NDArray[np.float32]
     least: NDArray[np.floating]
     most: NDArray[np.floating]
+
+
+def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int) -> NDArray[np.float64]:
+    """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at pose ``first`` of ``(frames, 4, 4)``."""
+    target = first + sources // 2
+    others = np.delete(np.arange(first, first + sources + 1), sources // 2)
+    return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target])

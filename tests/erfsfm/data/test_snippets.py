@@ -18,9 +18,9 @@ from torch.utils.data import DataLoader
 from erfsfm.common.errors import DataError
 from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
-from erfsfm.data.many_view_teacher import snippet_motion
 from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
+from erfsfm.labels.structure import snippet_motion
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet

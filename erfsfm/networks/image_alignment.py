@@ -1,9 +1,12 @@
-"""Rotations of a pose network's guess, measured in the images: what is seen in two frames must meet.
+"""Rotations of a pose network's guess measured in the images, and its path bent accordingly.
 
 Between neighbouring frames cells of the image are followed from coarse to fine (Lucas and Kanade 1981), beginning where
 the guessed motion over a road would carry them. The rotation by which the rays of all cells meet follows by least
 squares; the depth of a cell is known hardly at all, so that parallax of something near is not taken for a turn. Where
-an image shows nothing to follow, the guess stays. Nothing here is learned.
+an image shows nothing to follow, the guess stays.
+
+Within a snippet a camera moves steadily: its path is made of equal steps in the guessed direction of travel, which
+turns with the camera. Nothing here is learned.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ _OUTLIERS = (4.0, 1.5)  # of the linearisations, in NOISE
 
 
 def aligned(vectors: Tensor, target: Tensor, sources: Sequence[Tensor]) -> Tensor:
-    """The motion with rotations measured in the images; where the cameras are in the target's frame stays as guessed.
+    """The motion with rotations measured in the images, and a steady path along them in the guessed direction.
 
     Args:
         vectors: guessed pose vectors ``(B, N, 6)``.
@@ -63,20 +66,24 @@ def aligned(vectors: Tensor, target: Tensor, sources: Sequence[Tensor]) -> Tenso
 def _aligned(vectors: Tensor, target: Tensor, sources: list[Tensor]) -> Tensor:
     middle, count = len(sources) // 2, len(sources)
     images = torch.stack([*sources[:middle], target, *sources[middle:]], dim=1)
-    R, t = euler_to_rotation(vectors[..., 3:]), vectors[..., :3]
-    R_all = _inserted(R, torch.eye(3, device=R.device), middle)
-    t_all = _inserted(t, torch.zeros(3, device=t.device), middle)
+    R_all = _inserted(euler_to_rotation(vectors[..., 3:]), torch.eye(3, device=vectors.device), middle)
+    t_all = _inserted(vectors[..., :3], torch.zeros(3, device=vectors.device), middle)
     R_step = R_all[:, 1:] @ R_all[:, :-1].transpose(-1, -2)  # each frame in the next one's camera
     t_step = t_all[:, 1:] - _turned(R_step, t_all[:, :-1])
+    # a step in the camera halfway, whose axes are the means of those of the cameras before and after
+    travel = ((t_step + _turned(R_step.transpose(-1, -2), t_step)) / 2).mean(dim=1, keepdim=True)
     R_step = _rotations(images, R_step.flatten(0, 1), t_step.flatten(0, 1)).reshape(R_step.shape)
-    measured = [torch.eye(3, device=R.device).expand_as(R_step[:, 0])]
+    t_step = (travel + _turned(R_step, travel.expand_as(t_step))) / 2
+    R, t = [torch.eye(3, device=vectors.device).expand_as(R_step[:, 0])], [torch.zeros_like(t_step[:, 0])]
     for k in range(middle - 1, -1, -1):
-        measured.insert(0, R_step[:, k].transpose(-1, -2) @ measured[0])
+        R_back = R_step[:, k].transpose(-1, -2)
+        t.insert(0, _turned(R_back, t[0] - t_step[:, k]))
+        R.insert(0, R_back @ R[0])
     for k in range(middle, count):
-        measured.append(R_step[:, k] @ measured[-1])
-    R_new = torch.stack(measured[:middle] + measured[middle + 1 :], dim=1)
-    t_new = _turned(R_new @ R.transpose(-1, -2), t)
-    return torch.cat([t_new, rotation_to_euler(R_new)], dim=-1)
+        t.append(_turned(R_step[:, k], t[-1]) + t_step[:, k])
+        R.append(R_step[:, k] @ R[-1])
+    del R[middle], t[middle]
+    return torch.cat([torch.stack(t, dim=1), rotation_to_euler(torch.stack(R, dim=1))], dim=-1)
 
 
 def _rotations(images: Tensor, R: Tensor, t: Tensor) -> Tensor:

@@ -70,14 +70,21 @@ def test_snippets_of_a_batch_do_not_mix() -> None:
     torch.testing.assert_close(both, torch.cat(alone), atol=1e-5, rtol=0)
 
 
-def test_cameras_stay_where_they_were_guessed_in_the_targets_frame() -> None:
-    target, sources = snippet(TURNS)
-    guess = torch.cat([torch.tensor([[0.01, -0.002, z] for z in (0.08, 0.04, -0.04, -0.08)]), torch.zeros(4, 3)], -1)[
-        None
-    ]
-    T_before, T_after = pose_vector_to_matrix(guess), pose_vector_to_matrix(aligned(guess, target, sources))
-    before, after = (-(T[..., :3, :3].mT @ T[..., :3, 3:]) for T in (T_before, T_after))
-    torch.testing.assert_close(after, before, atol=1e-6, rtol=0)
+def test_a_path_bends_with_the_measured_turns() -> None:
+    """Equal steps on a circle, whatever turns were guessed: the direction of travel is that of the camera halfway."""
+    yaw, step = math.radians(1.5), torch.tensor([0.0004, -0.0002, 0.004])
+    circle = [torch.eye(4)]
+    for _ in range(4):
+        ahead, half = torch.eye(4), torch.tensor([0.0, yaw / 2, 0.0])
+        ahead[:3, :3], ahead[:3, 3] = euler_to_rotation(2 * half), euler_to_rotation(half) @ step
+        circle.append(circle[-1] @ ahead)  # T_first_k
+    T_k_target = [torch.linalg.inv(T_first_k) @ circle[2] for T_first_k in circle if T_first_k is not circle[2]]
+    true = torch.stack(T_k_target)
+    target, sources = snippet(torch.rad2deg(torch.tensor([[0, yaw * k, 0] for k in (2, 1, -1, -2)])))
+    guess = torch.cat([torch.stack([k * step for k in (2, 1, -1, -2)]), torch.zeros(4, 3)], -1)[None]
+    measured = pose_vector_to_matrix(aligned(guess, target, sources)[0])
+    torch.testing.assert_close(measured[:, :3, :3], true[:, :3, :3], atol=1e-3, rtol=0)
+    torch.testing.assert_close(measured[:, :3, 3], true[:, :3, 3], atol=1e-5, rtol=0)
 
 
 def test_a_network_guesses_in_training_and_measures_afterwards() -> None:

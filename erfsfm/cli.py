@@ -154,6 +154,9 @@ def evaluate_depth(
     ] = None,
     fidelity: Fidelity = "default",
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
+    pictures: Annotated[
+        Path | None, typer.Option(help="folder that receives a picture of each street: image, depths and truth")
+    ] = None,
     output: Annotated[Path | None, typer.Option(help="a file that receives the JSON as well")] = None,
     device: Device = "auto",
     seed: UnusedSeed = 0,
@@ -178,15 +181,15 @@ def evaluate_depth(
         raise ConfigError("--sequence and --cache belong to --truth many-views")
     if fidelity == "paper" and split is None:
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
-    if max(len(dataset), len(weights)) > 1 and (truth == "many-views" or split is not None):
-        raise ConfigError("--split and --truth many-views take one --dataset and one --weights")
+    if (max(len(dataset), len(weights)) > 1 or pictures) and (truth == "many-views" or split is not None):
+        raise ConfigError("--split and --truth many-views take one --dataset, one --weights, and no --pictures")
     names = weights if len(weights) > 1 else ["networks"]
     networks = {name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)}
     with progress_bar() as show:
         if truth == "many-views":
             rows = many_view_protocol(networks["networks"], dataset[0], sequence or (), cache, allow_leak, show)
         elif split is None:
-            rows = depth_protocol(networks, dataset, allow_leak, show)
+            rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
         else:
             rows = eigen_protocol(networks["networks"], dataset[0], split, fidelity, allow_leak)
     _show(rows, output, as_json)

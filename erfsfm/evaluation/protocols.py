@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import Fidelity
@@ -28,6 +31,7 @@ from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network,
 from erfsfm.evaluation.streets import find_streets
 
 _BASELINE = "median depth map"
+_PICTURE_WIDTH = 620
 
 
 class PoseDepthNetworks(Protocol):
@@ -49,7 +53,11 @@ class PoseDepthNetworks(Protocol):
 
 
 def depth_protocol(
-    networks: Mapping[str, PoseDepthNetworks], roots: Sequence[Path], allow_leak: bool, progress: Progress = silent
+    networks: Mapping[str, PoseDepthNetworks],
+    roots: Sequence[Path],
+    allow_leak: bool,
+    progress: Progress = silent,
+    pictures: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Median-scaled depth errors under 80 m on the streets of all roots, each of which counts alike.
 
@@ -58,6 +66,7 @@ def depth_protocol(
         roots: with true depth.
         allow_leak: evaluate also streets that networks were trained on.
         progress: told of the stage, what is done, and of how many.
+        pictures: a folder that receives a picture of the first frame of each street: image, depths, and truth.
 
     Returns:
         A row for each networks, and, where depth is dense, one for the median depth map of a root, a baseline that
@@ -79,6 +88,11 @@ def depth_protocol(
             progress("depth", done, total)
             image, truth = load()
             guesses = {name: each.depth(image) for name, each in networks.items()}
+            if pictures is not None and load is street.frames[0]:
+                jpeg = _picture(image, guesses.values(), truth)
+                write_atomically(
+                    pictures / f"{street.name.replace('/', '-')}.jpg", partial(Path.write_bytes, data=jpeg)
+                )
             if street.typical is not None:
                 guesses[_BASELINE] = street.typical
             for name, guess in guesses.items():
@@ -99,6 +113,21 @@ def depth_protocol(
             row = _depth_row(name, [errors[name][place]], None if name == first else [errors[first][place]])
             rows.append(row | {"leak": leaks[name][place], "street": street.name})
     return rows
+
+
+def _picture(image: NDArray[np.uint8], guesses: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:
+    """A JPEG, image, median-scaled depths and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
+    known = truth > 0
+    scaled = [guess * np.float32(np.median(truth[known]) / np.median(guess[known])) for guess in guesses]
+    nearness = [1 / depth for depth in scaled] + [np.where(known, 1 / np.where(known, truth, 1), 0)]
+    height, width = (round(n * min(1, _PICTURE_WIDTH / image.shape[1])) for n in image.shape[:2])
+    points = 1 + 2 * round(image.shape[1] / _PICTURE_WIDTH)  # of LiDAR, which would vanish in a smaller picture
+    nearness[-1] = cv2.dilate(nearness[-1], np.ones((points, points)))
+    brightest = np.percentile(nearness[-1][nearness[-1] > 0], 98)
+    shades = [np.clip(values / brightest * 255, 0, 255).astype(np.uint8) for values in nearness]
+    coloured = [cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA) for shade in shades]
+    rows = [cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in (image[..., ::-1], *coloured)]
+    return bytes(cv2.imencode(".jpg", np.vstack(rows))[1])
 
 
 def pose_protocol(

@@ -69,6 +69,18 @@ def test_streets_count_alike_and_have_standard_errors(tmp_path: Path) -> None:
     assert mean["a1"] == pytest.approx((1 - 0.25 / 2 + 1) / 2)
 
 
+def test_a_picture_of_each_street_shows_image_depths_and_truth(tmp_path: Path) -> None:
+    write_pairs(tmp_path / "pairs", "06", [True, False])
+    networks = {"a": Flat(), "b": Slanted()}
+    depth_protocol(networks, [tmp_path / "pairs"], allow_leak=False, pictures=tmp_path / "pictures")
+    (file,) = (tmp_path / "pictures").iterdir()
+    assert file.name == "folder-pairs-06.jpg"
+    image, flat, slanted, truth = np.split(cv2.imread(str(file)).astype(int).sum(axis=2), 4)
+    assert image.max() < 30 and np.ptp(flat) < 30
+    assert slanted[:, 0].mean() > slanted[:, -1].mean() + 100, "near is bright"
+    assert truth[40, 40] > truth[50, 50] + 100 > truth[20, 20] + 200, "unknown is dark"
+
+
 def test_networks_are_compared_street_by_street(tmp_path: Path) -> None:
     write_pairs(tmp_path / "pairs", "06", [True] * 4)
     write_pairs(tmp_path / "pairs", "08", [True, False])

@@ -47,7 +47,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("run", type=Path, help="output folder of erfsfm train")
     parser.add_argument("name", help="name of the shipped weights")
-    parser.add_argument("--mean-with", help="weights whose mean with the run's is shipped: those that it began from")
+    parser.add_argument("--mean-with", action="append", default=[], help="weights to average with the run's; repeat")
     parser.add_argument("--data", required=True, help="one line: what it was trained on")
     parser.add_argument("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
     parser.add_argument("--command", help="in place of the recorded one, without the paths of one machine")
@@ -56,9 +56,7 @@ def main() -> None:
     parser.add_argument("--evaluation", default="validation of the training run", help="the command behind --metrics")
     arguments = parser.parse_args()
 
-    model = load_model(arguments.run)
-    if arguments.mean_with:
-        model = averaged(model, load_model(arguments.mean_with))
+    model = averaged([load_model(each) for each in (arguments.run, *arguments.mean_with)])
     folder = SHIPPED / arguments.name
     record = model.record.model_copy(update={"command": arguments.command or model.record.command})
     save_model(folder, Model(record, model.depth_net, model.pose_net), half=True)
@@ -86,13 +84,17 @@ def main() -> None:
     print(f"{folder}: read {folder / 'README.md'}")
 
 
-def averaged(model: Model, other: Model) -> Model:
-    """Networks with the mean of both weights (Wortsman et al. 2022, robust fine-tuning)."""
-    for network, start in ((model.depth_net, other.depth_net), (model.pose_net, other.pose_net)):
-        state = start.state_dict()
-        mean = {k: (v + state[k]) / 2 if v.is_floating_point() else v for k, v in network.state_dict().items()}
-        network.load_state_dict(mean)
-    seen = merge([*model.record.trained_on, *other.record.trained_on])
+def averaged(models: list[Model]) -> Model:
+    """The first, whose networks have the mean of the weights of all (Wortsman et al. 2022, model soups)."""
+    model = models[0]
+    for kind in ("depth_net", "pose_net"):
+        states = [getattr(each, kind).state_dict() for each in models]
+        mean = {
+            k: sum(each[k] for each in states) / len(states) if v.is_floating_point() else v
+            for k, v in states[0].items()
+        }
+        getattr(model, kind).load_state_dict(mean)
+    seen = merge([name for each in models for name in each.record.trained_on])
     return Model(model.record.model_copy(update={"trained_on": seen}), model.depth_net, model.pose_net)
 
 

@@ -72,11 +72,11 @@ def write_model(
     colours = np.full((len(points), 3), _GREY, np.uint8)
     if cloud is not None:
         if len(points):
-            colours = cloud.colours_or_grey[cKDTree(cloud.points).query(points)[1]]
+            colours = cloud.colours[cKDTree(cloud.points).query(points)[1]]
         count = len(cloud.points) if at_most is None else min(max(at_most - len(points), 0), len(cloud.points))
         rows = np.linspace(0, len(cloud.points) - 1, count).round().astype(np.intp)
         points = np.concatenate([points, cloud.points[rows]])
-        colours = np.concatenate([colours, cloud.colours_or_grey[rows]])
+        colours = np.concatenate([colours, cloud.colours[rows]])
     write_colmap(output, places.intrinsics, trajectory.T_world_camera, points, colours, sightings, without)
 
 

@@ -21,13 +21,8 @@ from slam.runtime.storage.files import write_atomically
 TRANSFORMS = "transforms.json"
 T_CAMERA_OPENGL: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_PIXEL = 0.5
-_MARK = "erfsfm-slam"
-
-
-def is_own_scene(folder: Path) -> bool:
-    """Whether the scene in a folder is one that `write_transforms` described."""
-    path = folder / TRANSFORMS
-    return path.is_file() and f'"made_by": "{_MARK}"'.encode() in path.read_bytes()
+_MADE_BY = {"made_by": "erfsfm-slam"}
+MARK = json.dumps(_MADE_BY)[1:-1]
 
 
 def write_transforms(
@@ -40,16 +35,13 @@ def write_transforms(
         intrinsics: the one camera, without distortion.
         T_world_camera: poses ``(4, 4)`` by the names of their images.
         points: name of the PLY file of the cloud; None without.
-
-    Raises:
-        RunError: the file cannot be written.
     """
     frames = [
         {"file_path": name, "transform_matrix": (pose @ T_CAMERA_OPENGL).tolist()}
         for name, pose in T_world_camera.items()
     ]
     scene: dict[str, Any] = {
-        "made_by": _MARK,
+        **_MADE_BY,
         "camera_model": "OPENCV",
         "fl_x": float(intrinsics.fx),
         "fl_y": float(intrinsics.fy),
@@ -57,10 +49,7 @@ def write_transforms(
         "cy": float(intrinsics.cy) + _HALF_PIXEL,
         "w": intrinsics.width,
         "h": intrinsics.height,
-        "k1": 0.0,
-        "k2": 0.0,
-        "p1": 0.0,
-        "p2": 0.0,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
     }
     scene |= {} if points is None else {"ply_file_path": points}
     text = json.dumps(scene | {"frames": frames}, indent=2, allow_nan=False) + "\n"

@@ -5,7 +5,7 @@ import pytest
 from erfsfm.common.readers.camera_file import CameraFile
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
-from slam.sequences.undistortion import Undistortion, calibrated
+from slam.sequences.undistortion import Undistortion
 
 WIDTH, HEIGHT = 320, 240
 LENSES = {
@@ -89,20 +89,3 @@ def test_folding_lens_is_refused_or_cropped() -> None:
     folded = lens("barrel").model_copy(update={"distortion": (-9.0, 3.0, 0.0, 0.0)})
     with pytest.raises(SequenceError, match=r"distortion \[-9.* folds the image"):
         Undistortion(folded)
-
-
-class Blank:
-    def __init__(self, width: int, height: int) -> None:
-        self.width, self.height = width, height
-
-    def __len__(self) -> int:
-        return 1
-
-    def read(self, index: int) -> np.ndarray:
-        return np.zeros((self.height, self.width, 3), np.uint8)
-
-
-def test_distorted_images_are_read_flat() -> None:
-    images, intrinsics = calibrated(Blank(WIDTH, HEIGHT), lens("barrel"), "here")
-    assert images.read(0).shape == (HEIGHT, WIDTH, 3) and len(images) == 1
-    assert intrinsics.fx < 180  # a barrel lens sees more than its pinhole

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -300,16 +300,3 @@ def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(imports.importlib, "import_module", absent)
     with pytest.raises(SequenceError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
         open_sequence(tmp_path / "walk.bag")
-
-
-def compressed(new_bag: NewBag, kind: str, count: int, damaged: Collection[int]) -> Path:
-    """A bag of PNG pictures, of which some are cut off."""
-    bag = new_bag(kind)
-    bag.camera_info("/c/camera_info", CAMERA, "", ())
-    for k in range(count):
-        data = cv2.imencode(".png", picture(k, 3))[1].ravel()
-        cut = data[: len(data) // 2] if k in damaged else data
-        header = bag.header(FIRST_NS + k * STEP_NS, "c")
-        message = bag.make("sensor_msgs/msg/CompressedImage", header=header, format="png", data=cut)
-        bag.write("/c/image/compressed", FIRST_NS + k * STEP_NS, message)
-    return bag.close()

@@ -125,7 +125,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
         raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
     bad = BadRows(path, TrajectoryError)
     lines, rows, numbers = _read_numbers(path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad)
-    columns, is_finite = numbers.shape[1], np.isfinite(numbers).all(axis=1)
+    columns, is_finite = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
     checks = [(is_finite, "a number is not finite")]
     numbers = np.where(is_finite[:, None], numbers, 0.0)
     if columns in _COLUMNS["kitti"]:

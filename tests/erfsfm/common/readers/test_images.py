@@ -66,12 +66,6 @@ def test_one_stretch_serves_a_whole_recording(tmp_path: Path) -> None:
     assert stretch_of(paths, read_values) is None
 
 
-def test_depth_maps_keep_their_values(tmp_path: Path) -> None:
-    depth = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
-    cv2.imwrite(str(tmp_path / "d.png"), depth)
-    np.testing.assert_array_equal(read_values(tmp_path / "d.png"), depth)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("keep", [0.0, 0.97])
 def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float) -> None:

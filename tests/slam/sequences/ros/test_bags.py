@@ -66,20 +66,10 @@ def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
     assert np.array_equal(open_sequence(bag.close()).frame(0).image, expected)
 
 
-@pytest.mark.parametrize(
-    "encoding, channels",
-    [
-        ("rgb8", 3),
-        ("bgr8", 3),
-        ("rgba8", 4),
-        ("bgra8", 4),
-        ("8UC3", 3),
-        ("yuv422", 2),
-        ("yuv422_yuy2", 2),
-        ("mono16", 1),
-        ("16UC1", 1),
-    ],
-)
+CHANNELS = {"rgb8": 3, "bgra8": 4, "8UC3": 3, "yuv422": 2, "yuv422_yuy2": 2, "mono16": 1, "16UC1": 1}
+
+
+@pytest.mark.parametrize(("encoding", "channels"), CHANNELS.items())
 def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: int) -> None:
     """Channels of equal value are grey in every encoding; of YUV 4:2:2 those with chroma 128."""
     level = 90

@@ -10,12 +10,11 @@ import numpy as np
 
 from erfsfm.common.files import is_foreign
 from erfsfm.common.progress import Progress, silent
-from slam.commands.occupancy import THRESHOLDS, occupancy_grid, write_ros_map
-from slam.commands.scenes import POINTS, write_model, write_scene
+from slam.commands.occupancy import occupancy_grid, write_ros_map
+from slam.commands.scenes import MARK, POINTS, TRANSFORMS, write_model, write_scene
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.trajectory import Trajectory
-from slam.formats.transforms import MARK, TRANSFORMS
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
@@ -110,7 +109,7 @@ def _check_target(what: str, output: Path) -> None:
     if what == "occupancy":
         files = [output.with_suffix(suffix) for suffix in beginnings]
         present = [path for path in files if path.is_file() and path.stat().st_size]
-        if present and not _is_own(files[0], min(THRESHOLDS)):
+        if present and not _is_own(files[0], "occupied_thresh:"):
             raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
     for path in files:
         check_replaced(path, beginnings)

@@ -18,7 +18,7 @@ from slam.runtime.errors import RunError
 from slam.runtime.storage.files import write_atomically
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
-THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}
+_THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}
 OBSTACLE_FROM_M, OBSTACLE_TO_M = 0.3, 2.5
 _USUAL_CAMERA_HEIGHT_M = 1.65
 _HOLE_M = 0.5  # gaps of the map in the road, up to this wide, are closed
@@ -231,7 +231,7 @@ def write_ros_map(
         "resolution": resolution,
         "origin": [*corner, 0.0],
         "negate": 0,
-        **THRESHOLDS,
+        **_THRESHOLDS,
     }
     text = f"# lengths in {unit}\n" + yaml.safe_dump(description, sort_keys=False, default_flow_style=None)
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), RunError)

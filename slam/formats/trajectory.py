@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +127,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     bad = BadRows(path, TrajectoryError)
     lines, rows, numbers = _read_numbers(path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad)
     columns, is_finite = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
-    checks = [(is_finite, "a number is not finite")]
+    checks: list[tuple[Any, str]] = [(is_finite, "a number is not finite")]
     numbers = np.where(is_finite[:, None], numbers, 0.0)
     if columns in _COLUMNS["kitti"]:
         T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from erfsfm.common.errors import ConfigError, ErfsfmError
+from erfsfm.common.errors import ConfigError
 from erfsfm.common.files import read_text
 
 M = TypeVar("M", bound=BaseModel)
@@ -54,11 +54,7 @@ def load_config(
 
 
 def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
-    """The YAML file of a path or of a shipped name.
-
-    Raises:
-        ConfigError: neither a file nor a known name.
-    """
+    """The YAML file of a path or of a shipped name."""
     path = Path(file_or_name)
     if path.is_file():
         return path
@@ -102,15 +98,10 @@ def first_problem(error: ValidationError) -> str:
 
 
 def _read_tree(path: Path) -> dict[str, Any]:
-    try:
-        tree = read_yaml(path)
-    except YamlError as error:
-        raise ConfigError(str(error)) from error
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
+    tree = read_yaml(path)
+    if not isinstance(tree, dict | None):
         raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
-    return tree
+    return tree or {}
 
 
 def _override(tree: dict[str, Any], text: str) -> None:
@@ -177,7 +168,7 @@ def _shown(value: Any) -> str:
 MAX_BYTES = 2**18
 
 
-class YamlError(ErfsfmError):
+class YamlError(ConfigError):
     """Text or a file is not YAML that this project reads."""
 
 
@@ -200,21 +191,13 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_yaml(text: str) -> Any:
-    """The value of a YAML text.
-
-    Raises:
-        YamlError: the problem and its line, in one line.
-    """
+    """The value of a YAML text."""
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
         problem, mark = getattr(error, "problem", None) or str(error), getattr(error, "problem_mark", None)
         raise YamlError(f"{problem} (line {mark.line + 1})" if mark else problem) from error
-    except (
-        ValueError,
-        TypeError,
-        RecursionError,
-    ) as error:  # a date that does not exist, a list for a key, endless lists
+    except (ValueError, TypeError, RecursionError) as error:  # no date, a list for a key, endless lists
         raise YamlError(str(error)) from error
 
 

@@ -51,7 +51,8 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
         path.parent.mkdir(parents=True, exist_ok=True)
         fill(partial)
         if sync:
-            _sync(partial)
+            with partial.open("r+b") as file:
+                os.fsync(file.fileno())
         partial.replace(path)
     except OSError as cause:
         raise OSError(f"{path}: cannot be written ({cause.strerror or cause})") from cause
@@ -96,11 +97,6 @@ def unfinished_name(path: Path) -> str | None:
     return match["name"] if match else None
 
 
-def _sync(path: Path) -> None:
-    with path.open("r+b") as file:
-        os.fsync(file.fileno())
-
-
 def require_figure(path: Path) -> None:
     """Check that a figure may be written there, before it is drawn.
 
@@ -109,16 +105,12 @@ def require_figure(path: Path) -> None:
     """
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         raise ConfigError(f"figures are written as {', '.join(FIGURE_SUFFIXES)}; got '{path.name}'")
-    if path.is_file() and _FIGURE_MARK.encode() not in path.read_bytes():
+    if is_foreign(path, _FIGURE_MARK):
         raise ConfigError(f"{path} exists and is no figure of erfsfm: choose another --output, or remove it")
 
 
 def save_figure(figure: Figure, path: Path, dpi: int) -> None:
-    """Write a figure in the format of its name; equal figures are equal files.
-
-    Raises:
-        ConfigError, OSError: it may not or cannot be written.
-    """
+    """Write a figure in the format of its name; equal figures are equal files."""
     require_figure(path)
     suffix = path.suffix.lower()
     metadata = _FIGURE_METADATA[suffix]
@@ -129,15 +121,8 @@ class FolderLock(ExitStack):
     """Folders held until the end of a block, or of the process, however it ends; nothing is left in them."""
 
     def take(self, folder: Path) -> None:
-        """Hold a folder, which is made; without effect where the file system has no locks, or no folder can be made.
-
-        Raises:
-            BusyError: another process holds it.
-        """
-        try:
-            self._lock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BusyError(f"another process writes to {folder}: wait, or choose another --output") from error
+        """Hold a folder, which is made; without effect where the file system has no locks, or no folder can be made."""
+        self._lock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def wait_for(self, folder: Path) -> None:
         """Hold a folder as soon as no other process does; else as `take`."""
@@ -152,7 +137,7 @@ class FolderLock(ExitStack):
         self.callback(os.close, descriptor)
         try:
             fcntl.flock(descriptor, how)
-        except BlockingIOError:
-            raise
+        except BlockingIOError as error:
+            raise BusyError(f"another process writes to {folder}: wait, or choose another --output") from error
         except OSError:  # no locks here
             return

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from erfsfm.common.errors import TrainingError
@@ -76,17 +76,13 @@ def slam_process(
             process.kill()
             process.wait()
         said.seek(max(said.seek(0, os.SEEK_END) - _MOST_SAID, 0))
-        return exceeded or why_ended(process.returncode, said.read().decode(errors="replace"))
-
-
-def why_ended(code: int, stderr: str) -> str:
-    """Why a process failed, in one line; empty where it did not."""
-    if code == 0:
-        return ""
+        lines = [line.strip() for line in said.read().decode(errors="replace").splitlines() if line.strip()]
+    code = process.returncode
+    if exceeded or code == 0:
+        return exceeded
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"
-    lines = [line.removeprefix("erfsfm-slam: ").strip() for line in stderr.splitlines() if line.strip()]
-    return lines[-1] if lines else f"exit code {code}"
+    return lines[-1].removeprefix("erfsfm-slam: ") if lines else f"exit code {code}"
 
 
 def _watch(process: subprocess.Popen[bytes], memory_gib: float) -> str:
@@ -96,15 +92,9 @@ def _watch(process: subprocess.Popen[bytes], memory_gib: float) -> str:
             process.wait(_POLL_S)
             return ""
         except subprocess.TimeoutExpired:
-            used = _resident_bytes(process.pid) / _GIB if memory_gib else 0.0
-            if used > memory_gib:
+            used = 0.0
+            with suppress(OSError, IndexError, ValueError):  # it has ended, or the system tells nothing
+                pages = int(Path(f"/proc/{process.pid}/statm").read_text(encoding="ascii").split()[1])
+                used = pages * os.sysconf("SC_PAGE_SIZE") / _GIB
+            if 0 < memory_gib < used:
                 return f"it used {used:.1f} GiB of memory, more than the {memory_gib:.1f} GiB of --memory"
-
-
-def _resident_bytes(pid: int) -> int:
-    """Resident memory of a process; 0 where it cannot be read."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
-    except (OSError, IndexError, ValueError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -28,23 +28,17 @@ def calling_on_signals(stop: Callable[..., None]) -> Iterator[None]:
 
     Only in the main thread, and only for signals that are not ignored already.
     """
-    handlers: dict[int, Any] = {}
-    if threading.current_thread() is threading.main_thread():
-        numbers = [getattr(signal, name) for name in ("SIGINT", *_NAMES) if hasattr(signal, name)]
-        handlers = {n: before for n in numbers if (before := signal.getsignal(n)) is not signal.SIG_IGN}
+    before = _handlers(("SIGINT", *_NAMES), lambda handler: handler is not signal.SIG_IGN)
 
     def first(*_: object) -> None:
-        for number in handlers:
-            signal.signal(number, handlers[number] if number == signal.SIGINT else signal.SIG_IGN)
+        _handle(dict.fromkeys(before, signal.SIG_IGN) | {n: before[n] for n in before if n == signal.SIGINT})
         stop()
 
-    for number in handlers:
-        signal.signal(number, first)
+    _handle(dict.fromkeys(before, first))
     try:
         yield
     finally:
-        for number, before in handlers.items():
-            signal.signal(number, before)
+        _handle(before)
 
 
 @contextmanager
@@ -57,23 +51,30 @@ def raising_on_termination() -> Iterator[Callable[[], None]]:
         A function that ignores these signals for the rest of the block: ``timeout`` and shells send the same one
         several times, and the files written after the first one must become whole.
     """
-    numbers: list[int] = []
-    if threading.current_thread() is threading.main_thread():
-        known = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-        numbers = [number for number in known if signal.getsignal(number) is signal.SIG_DFL]
+    before = _handlers(_NAMES, lambda handler: handler is signal.SIG_DFL)
+
+    def ignore() -> None:
+        _handle(dict.fromkeys(before, signal.SIG_IGN))
 
     def end(number: int, _: object) -> None:
         ignore()
         raise Terminated(number)
 
-    def ignore() -> None:
-        for number in numbers:
-            signal.signal(number, signal.SIG_IGN)
-
-    for number in numbers:
-        signal.signal(number, end)
+    _handle(dict.fromkeys(before, end))
     try:
         yield ignore
     finally:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+        _handle(before)
+
+
+def _handlers(names: Sequence[str], is_replaced: Callable[[Any], bool]) -> dict[int, Any]:
+    """Handlers that may be replaced, by signal; none outside the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    handlers = {number: signal.getsignal(number) for name in names if (number := getattr(signal, name, None))}
+    return {number: handler for number, handler in handlers.items() if is_replaced(handler)}
+
+
+def _handle(handlers: Mapping[int, Any]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)

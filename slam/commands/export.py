@@ -8,14 +8,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from erfsfm.common.files import is_foreign
 from erfsfm.common.progress import Progress, silent
-from slam.commands.occupancy import occupancy_grid
-from slam.commands.scenes import POINTS, write_model, write_scene
-from slam.formats.colmap import BINARY_FOLDER, MODEL_FILES, is_own_model
+from slam.commands.occupancy import occupancy_grid, write_ros_map
+from slam.commands.scenes import MARK, POINTS, TRANSFORMS, write_model, write_scene
+from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
-from slam.formats.ros_map import describes_map, write_ros_map
 from slam.formats.trajectory import Trajectory
-from slam.formats.transforms import TRANSFORMS, is_own_scene
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
@@ -33,8 +32,8 @@ R_UP_WORLDS: dict[Up, FloatArray] = {
 }
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
 _SCENES = {
-    "colmap": ("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), is_own_model),
-    "nerfstudio": ("a scene", ("images", POINTS, TRANSFORMS), is_own_scene),
+    "colmap": ("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), MODEL_FILES[0], HEADER),
+    "nerfstudio": ("a scene", ("images", POINTS, TRANSFORMS), TRANSFORMS, MARK),
 }
 _TAKERS = {"resolution": ("occupancy",), "dataset": tuple(_SCENES), "points": ("colmap",)}
 _RESOLUTION = 0.1  # of an occupancy grid
@@ -95,11 +94,11 @@ def export(
 def _check_target(what: str, output: Path) -> None:
     """Refuse, before anything is computed, what would replace a file of another kind."""
     if what in _SCENES:
-        noun, names, is_own = _SCENES[what]
+        noun, names, marked, mark = _SCENES[what]
         if output.exists() and not output.is_dir():
             raise RunError(f"{output} is a file: {noun} is several files, give the name of a folder")
         others = [name for name in names if (output / name).exists()]
-        if others and not is_own(output):
+        if others and not _is_own(output / marked, mark):
             raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
         return
     beginnings = {".yaml": b"", ".pgm": b"P5"} if what == "occupancy" else {".ply": b"ply"}
@@ -110,10 +109,14 @@ def _check_target(what: str, output: Path) -> None:
     if what == "occupancy":
         files = [output.with_suffix(suffix) for suffix in beginnings]
         present = [path for path in files if path.is_file() and path.stat().st_size]
-        if present and not describes_map(files[0]):
+        if present and not _is_own(files[0], "occupied_thresh:"):
             raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
     for path in files:
         check_replaced(path, beginnings)
+
+
+def _is_own(path: Path, mark: str) -> bool:
+    return path.is_file() and not is_foreign(path, mark)
 
 
 def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Path:

@@ -30,10 +30,10 @@ from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import PLACES
-from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
+from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.recording import frame_range
-from slam.sequences.undistortion import Undistortion, intrinsics_of
+from slam.sequences.undistortion import undistorted
 
 _PLACES_TRIED = 8
 _STARTS = 3  # of these are refined
@@ -105,8 +105,8 @@ def localise(
             f"{run.path} undistorted its images, and {images} has no {CAMERA_FILE}: give its --camera, which is fov=70 "
             "for images without distortion"
         )
-    localiser = Localiser(places, None if own_camera is None else intrinsics_of(own_camera))
-    undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
+    intrinsics, undistortion = (None, None) if own_camera is None else undistorted(own_camera)
+    localiser = Localiser(places, intrinsics)
     numbers, found, unreadable = range(first, last, every), [], 0
     for number in numbers:
         name = paths[number].name
@@ -291,6 +291,4 @@ def _camera_file(explicit: Path | None, images: Path, paths: list[Path]) -> Came
     if explicit is None:
         folder = images if images.is_dir() else images.parent
         return beside(paths[0].parent, folder, folder.absolute().parent)
-    if is_field_of_view(explicit):
-        return explicit_camera(explicit, ImageFiles(in_order(paths)))
-    return read_explicit(explicit)
+    return explicit_camera(explicit, ImageFiles(in_order(paths)))

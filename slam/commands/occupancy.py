@@ -1,20 +1,24 @@
-"""An occupancy grid: free where the ground along a drive is seen, occupied where something stands on it."""
+"""An occupancy grid for ROS: free where the ground along a drive is seen, occupied where something stands on it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slam.formats.ply import Ply
-from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
+FREE, OCCUPIED, UNKNOWN = 254, 0, 205
+_THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}
 OBSTACLE_FROM_M, OBSTACLE_TO_M = 0.3, 2.5
 _USUAL_CAMERA_HEIGHT_M = 1.65
 _HOLE_M = 0.5  # gaps of the map in the road, up to this wide, are closed
@@ -201,6 +205,36 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
         anchors.append(anchor)
         slopes.append(slope)
     return Ground(np.array(anchors), np.array(slopes), _REACH * height)
+
+
+def write_ros_map(
+    path: Path, cells: NDArray[np.uint8], corner: tuple[float, float], resolution: float, unit: str
+) -> None:
+    """Write ``<name>.pgm`` and, after it, ``<name>.yaml``, each atomically.
+
+    Args:
+        path: the YAML file.
+        cells: ``(H, W)`` of `FREE`, `OCCUPIED` and `UNKNOWN`; the first row has the largest y.
+        corner: x and y of the outer corner at the bottom left.
+        resolution: side of a cell.
+        unit: of lengths, which ``map_server`` takes for metres: a comment says so.
+
+    Raises:
+        RunError: a file cannot be written.
+    """
+    height, width = cells.shape
+    image = path.with_suffix(".pgm")
+    content = f"P5\n{width} {height}\n255\n".encode("ascii") + np.ascontiguousarray(cells).tobytes()
+    write_atomically(image, lambda partial: partial.write_bytes(content), RunError)
+    description = {
+        "image": image.name,
+        "resolution": resolution,
+        "origin": [*corner, 0.0],
+        "negate": 0,
+        **_THRESHOLDS,
+    }
+    text = f"# lengths in {unit}\n" + yaml.safe_dump(description, sort_keys=False, default_flow_style=None)
+    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), RunError)
 
 
 def _spread(T_world_camera: FloatArray, step: float) -> list[int]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +16,6 @@ from erfsfm.common.progress import Progress
 from slam.formats.colmap import Sightings, write_colmap
 from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps
-from slam.formats.transforms import TRANSFORMS, write_transforms
 from slam.frames import Image, Sequence
 from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places
@@ -29,7 +30,11 @@ from slam.sequences.catalogue import open_sequence
 
 logger = logging.getLogger(__name__)
 
-POINTS = "points.ply"
+POINTS, TRANSFORMS = "points.ply", "transforms.json"
+_MADE_BY = {"made_by": "erfsfm-slam"}
+MARK = json.dumps(_MADE_BY)[1:-1]  # of a ``transforms.json`` of ours
+_T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_HALF_PIXEL = 0.5  # (0.5, 0.5) is the centre of their top-left pixel
 _IMAGES = "images"
 _SAME_STAMP_S = 2e-3
 _SAME_PIXEL = 0.01
@@ -72,26 +77,42 @@ def write_model(
     colours = np.full((len(points), 3), _GREY, np.uint8)
     if cloud is not None:
         if len(points):
-            colours = cloud.colours_or_grey[cKDTree(cloud.points).query(points)[1]]
+            colours = cloud.colours[cKDTree(cloud.points).query(points)[1]]
         count = len(cloud.points) if at_most is None else min(max(at_most - len(points), 0), len(cloud.points))
         rows = np.linspace(0, len(cloud.points) - 1, count).round().astype(np.intp)
         points = np.concatenate([points, cloud.points[rows]])
-        colours = np.concatenate([colours, cloud.colours_or_grey[rows]])
+        colours = np.concatenate([colours, cloud.colours[rows]])
     write_colmap(output, places.intrinsics, trajectory.T_world_camera, points, colours, sightings, without)
 
 
 def write_scene(
     folder: RunFolder, output: Path, trajectory: Trajectory, cloud: Ply | None, dataset: Path | None, progress: Progress
 ) -> None:
-    """Write ``images/``, ``points.ply`` and, last, ``transforms.json``; arguments and errors as of `write_model`.
+    """Write ``images/``, ``points.ply`` and, last, ``transforms.json``, which tools for Gaussian splatting read.
 
-    Frames without a usable image are left out.
+    Its cameras have OpenGL's axes: x right, y up, z backwards. Frames without a usable image are left out. Arguments
+    and errors are those of `write_model`.
     """
     sequence, written = _write_images(folder, output, trajectory, dataset, progress)
-    poses = {_image_name(k): trajectory.T_world_camera[k] for k in written}
+    camera = sequence.intrinsics
+    scene: dict[str, Any] = {
+        **_MADE_BY,
+        "camera_model": "OPENCV",
+        "fl_x": float(camera.fx),
+        "fl_y": float(camera.fy),
+        "cx": float(camera.cx) + _HALF_PIXEL,
+        "cy": float(camera.cy) + _HALF_PIXEL,
+        "w": camera.width,
+        "h": camera.height,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+    }
     if cloud is not None:
         write_ply(output / POINTS, cloud)
-    write_transforms(output / TRANSFORMS, sequence.intrinsics, poses, None if cloud is None else POINTS)
+        scene["ply_file_path"] = POINTS
+    poses = {k: (trajectory.T_world_camera[k] @ _T_CAMERA_OPENGL).tolist() for k in written}
+    scene["frames"] = [{"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()]
+    text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
+    write_atomically(output / TRANSFORMS, lambda file: file.write_text(text, encoding="utf-8"), RunError)
 
 
 def _tracked(places: Places, at_most: int | None) -> tuple[FloatArray, Sightings]:

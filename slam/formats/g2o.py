@@ -13,40 +13,27 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.storage.files import write_atomically
 
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
-_UPPER = np.triu_indices(6)
+_UPPER = np.triu_indices(6)  # row by row
 _VERTEX, _EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 
 
 def write_g2o(path: Path, relative_poses: Sequence[RelativePose], T_world_camera: FloatArray) -> None:
-    """Write factors and poses ``(N, 4, 4)`` at full precision, atomically.
-
-    Raises:
-        SlamError: the file cannot be written.
-    """
+    """Write factors and poses ``(N, 4, 4)`` at full precision, atomically."""
     T_from_to = np.array([edge.T_from_to for edge in relative_poses]).reshape(-1, 4, 4)
-    lines = [f"{_VERTEX} {k} {pose}" for k, pose in enumerate(_g2o_poses(T_world_camera))]
-    lines += [
-        f"{_EDGE} {edge.from_index} {edge.to_index} {pose} {_g2o_information(edge.graph_sigmas)}"
-        for edge, pose in zip(relative_poses, _g2o_poses(T_from_to), strict=True)
-    ]
+    lines = [f"{_VERTEX} {k} {_numbers(pose)}" for k, pose in enumerate(_g2o_poses(T_world_camera))]
+    for edge, pose in zip(relative_poses, _g2o_poses(T_from_to), strict=True):
+        information = np.diag(1.0 / edge.graph_sigmas[_TRANSLATION_FIRST] ** 2)[_UPPER]
+        lines.append(f"{_EDGE} {edge.from_index} {edge.to_index} {_numbers(pose)} {_numbers(information)}")
     text = "\n".join(lines) + "\n"
     write_atomically(path, lambda file: file.write_text(text, encoding="ascii"))
 
 
-def _g2o_poses(T_a_b: FloatArray) -> list[str]:
-    """Translation and quaternion (xyzw) of poses ``(N, 4, 4)``, shortest digits of an exact round trip."""
-    if len(T_a_b) == 0:
-        return []
+def _g2o_poses(T_a_b: FloatArray) -> FloatArray:
+    """Translation and quaternion (xyzw) ``(N, 7)`` of poses ``(N, 4, 4)``."""
     quaternions_xyzw = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat(canonical=True)
-    rows = np.concatenate([T_a_b[:, :3, 3], quaternions_xyzw], axis=1)
-    return [_numbers(row) for row in rows]
-
-
-def _g2o_information(sigmas: FloatArray) -> str:
-    """Upper triangle row by row; g2o puts translation first."""
-    information = np.diag(1.0 / sigmas[_TRANSLATION_FIRST] ** 2)
-    return _numbers(information[_UPPER])
+    return np.concatenate([T_a_b[:, :3, 3], quaternions_xyzw], axis=1)
 
 
 def _numbers(row: FloatArray) -> str:
+    """With the shortest digits of an exact round trip."""
     return " ".join(map(repr, row.tolist()))

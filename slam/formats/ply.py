@@ -6,7 +6,7 @@ same layout and bytes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -43,15 +43,10 @@ class Ply:
         return np.stack([self.vertices[name].astype(np.float64) for name in _AXES], axis=1)
 
     @property
-    def colours(self) -> NDArray[np.uint8] | None:
-        """RGB ``(V, 3)``, None where the file has none."""
-        colours = self.columns(_COLOURS)
-        return None if colours is None else colours.astype(np.uint8)
-
-    @property
-    def colours_or_grey(self) -> NDArray[np.uint8]:
+    def colours(self) -> NDArray[np.uint8]:
         """RGB ``(V, 3)``, a middle grey where the file has none."""
-        return np.full((len(self.vertices), 3), 128, np.uint8) if self.colours is None else self.colours
+        colours = self.columns(_COLOURS)
+        return np.full((len(self.vertices), 3), 128, np.uint8) if colours is None else colours.astype(np.uint8)
 
 
 def read_ply(path: Path) -> Ply:
@@ -113,23 +108,18 @@ def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
 
 
 def write_ply(path: Path, ply: Ply) -> None:
-    """Write a binary PLY, atomically.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
-    triangles, vertices = ply.triangles, ply.vertices
-    faces = (None, None) if triangles is None else (len(triangles), lambda: iter([triangles]))
-    write_ply_pieces(path, vertices.dtype, len(vertices), lambda: iter([vertices]), *faces)
+    """As `write_ply_pieces`."""
+    faces = () if ply.triangles is None else (len(ply.triangles), [ply.triangles])
+    write_ply_pieces(path, ply.vertices.dtype, len(ply.vertices), [ply.vertices], *faces)
 
 
 def write_ply_pieces(
     path: Path,
     vertex_type: np.dtype[np.void],
     vertices: int,
-    vertex_pieces: Callable[[], Iterator[NDArray[np.void]]],
+    vertex_pieces: Iterable[NDArray[np.void]],
     triangles: int | None = None,
-    triangle_pieces: Callable[[], Iterator[NDArray[np.int64]]] | None = None,
+    triangle_pieces: Iterable[NDArray[np.int64]] = (),
 ) -> None:
     """Write a binary PLY, atomically, without its whole content in memory.
 
@@ -140,9 +130,6 @@ def write_ply_pieces(
         vertex_pieces: structured arrays ``(v,)``, one after another.
         triangles: number of triangles; None for a cloud.
         triangle_pieces: arrays ``(t, 3)`` of indices into all vertices.
-
-    Raises:
-        RunError: the file cannot be written.
     """
     lines = ["ply", "format binary_little_endian 1.0", "comment Created by erfsfm-slam", f"element vertex {vertices}"]
     lines += [f"property {_NAMES[vertex_type[name].str[1:]]} {name}" for name in vertex_type.names or ()]
@@ -152,9 +139,9 @@ def write_ply_pieces(
     def fill(partial: Path) -> None:
         with partial.open("wb") as file:
             file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
-            for piece in vertex_pieces():
+            for piece in vertex_pieces:
                 file.write(np.ascontiguousarray(piece).view(np.uint8).data)
-            for corners in triangle_pieces() if triangle_pieces is not None else ():
+            for corners in triangle_pieces:
                 faces = np.empty(len(corners), _TRIANGLE)
                 faces["count"], faces["vertices"] = 3, corners
                 file.write(faces.view(np.uint8).data)

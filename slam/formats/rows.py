@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +41,13 @@ class BadRows:
         """Leave out the row on this line."""
         self._reasons.setdefault(line, reason)
 
-    def without(self, good: NDArray[np.bool_], reason: str, lines: NDArray[np.intp], *columns: Any) -> Any:
-        """Lines ``(N,)`` and columns ``(N, ...)`` of the ``good`` ``(N,)`` rows; the others have this reason."""
-        for line in lines[~good].tolist():
-            self.add(line, reason)
-        return tuple(column[good] for column in (lines, *columns))
+    def without(self, checks: Sequence[tuple[Any, str]], lines: NDArray[np.intp], *columns: Any) -> tuple[Any, ...]:
+        """Lines ``(N,)`` and columns ``(N, ...)`` of the rows that pass all checks ``(N,)``; others have the reason."""
+        for is_good, reason in checks:
+            for line in lines[~is_good].tolist():
+                self.add(line, reason)
+        are_good = np.all([is_good for is_good, _ in checks], axis=0)
+        return tuple(column[are_good] for column in (lines, *columns))
 
     def in_order(
         self, stamps: NDArray[np.float64], what: str, lines: NDArray[np.intp], wanted: str
@@ -107,6 +110,12 @@ def text_of(path: Path, error: type[SlamError], wanted: str) -> str:
     except (OSError, UnicodeDecodeError) as cause:
         reason = getattr(cause, "strerror", None) or "this is not a text file (UTF-8)"
         raise error(f"{path}: {reason}; wanted {wanted}") from cause
+
+
+def rows_of(path: Path, error: type[SlamError], wanted: str) -> list[tuple[int, str]]:
+    """Line numbers and texts of the rows of a table, without blank lines and comments; as `text_of`."""
+    lines = enumerate(map(str.strip, text_of(path, error, wanted).splitlines()), start=1)
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
 def is_number(word: str) -> bool:

@@ -10,12 +10,13 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.formats.rows import BadRows, in_seconds, is_number, text_of
+from slam.formats.rows import BadRows, in_seconds, is_number, rows_of
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
@@ -125,28 +126,27 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
         raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
     bad = BadRows(path, TrajectoryError)
     lines, rows, numbers = _read_numbers(path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad)
-    columns, good = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
-    lines, rows, numbers = bad.without(good, "a number is not finite", lines, rows, numbers)
+    columns, is_finite = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
+    checks: list[tuple[Any, str]] = [(is_finite, "a number is not finite")]
+    numbers = np.where(is_finite[:, None], numbers, 0.0)
     if columns in _COLUMNS["kitti"]:
         T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
         T_world_camera[:, :3] = numbers[:, columns % 4 :][:, :12].reshape(-1, 3, 4)
     else:
-        good = np.asarray(np.abs(np.linalg.norm(numbers[:, -4:], axis=1) - 1.0) < _ROTATION_TOLERANCE)
-        lines, rows, numbers = bad.without(good, "the quaternion does not have length 1", lines, rows, numbers)
-        T_world_camera = se3.make(Rotation.from_quat(numbers[:, -4:].reshape(-1, 4)).as_matrix(), numbers[:, -7:-4])
+        is_unit = np.abs(np.linalg.norm(numbers[:, -4:], axis=1) - 1.0) < _ROTATION_TOLERANCE
+        checks.append((is_unit, "the quaternion does not have length 1"))
+        quaternions_xyzw = np.where(is_unit[:, None], numbers[:, -4:], [0.0, 0.0, 0.0, 1.0])
+        T_world_camera = se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, -7:-4])
     if columns == 7:
         T_world_camera = _T_TARTAN_CAMERA.T @ T_world_camera @ _T_TARTAN_CAMERA
-    far = np.asarray((np.abs(T_world_camera[:, :3, 3]) > _FARTHEST).any(axis=1))
-    lines, rows, numbers, T_world_camera = bad.without(
-        ~far, f"a position is farther than {_FARTHEST:g}", lines, rows, numbers, T_world_camera
-    )
+    is_near = (np.abs(T_world_camera[:, :3, 3]) <= _FARTHEST).all(axis=1)
+    checks.append((is_near, f"a position is farther than {_FARTHEST:g}"))
     R = T_world_camera[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # an overflow becomes NaN, which fails the check below
+    with np.errstate(over="ignore", invalid="ignore"):  # an overflow becomes NaN, which fails the check
         deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-        good = (deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)
-    lines, rows, numbers, T_world_camera = bad.without(
-        good, "the 3x3 part is not a rotation matrix", lines, rows, numbers, T_world_camera
-    )
+        is_rotation = (deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)
+    checks.append((is_rotation, "the 3x3 part is not a rotation matrix"))
+    lines, rows, numbers, T_world_camera = bad.without(checks, lines, rows, numbers, T_world_camera)
     timed, numbered = columns == 8, columns in (13, 17)
     stamps = numbers[:, 0] if timed or numbered else rows.astype(np.float64)
     order = bad.in_order(stamps, "time stamps" if timed else "frame numbers", lines, _WANTED)
@@ -157,22 +157,14 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
 
 
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
-    """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically; after its number where it has one.
-
-    Raises:
-        TrajectoryError: if the file cannot be written.
-    """
+    """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically; after its number where it has one."""
     rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
     numbers = (f"{stamp:.0f} " if trajectory.numbered else "" for stamp in trajectory.stamps)
     _write(Path(path), (number + _row(row) for number, row in zip(numbers, rows)))
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps are written with all their digits.
-
-    Raises:
-        TrajectoryError: if the file cannot be written.
-    """
+    """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps are written with all their digits."""
     quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
     poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
     stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
@@ -299,9 +291,7 @@ def _read_numbers(
     path: Path, forms: tuple[int, ...], bad: BadRows
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Line and row numbers ``(N,)`` of a file, and its table ``(N, columns)`` of the commonest of these forms."""
-    text = text_of(path, TrajectoryError, _WANTED)
-    content = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
-    table = [(number, _words(line)) for number, line in content if line and not line.startswith("#")]
+    table = [(number, _words(line)) for number, line in rows_of(path, TrajectoryError, _WANTED)]
     if table and not any(is_number(word) for word in table[0][1]):
         del table[0]  # a header
     counts = Counter(len(words) for _, words in table)

@@ -122,11 +122,11 @@ class MapSurface:
 
     def write_mesh(self, path: Path) -> None:
         """Write the mesh as binary PLY, atomically; ``RunError`` where that fails."""
-        write_ply_pieces(path, _FILLED, self.vertices, self.vertex_pieces, self.triangles, self.triangle_pieces)
+        write_ply_pieces(path, _FILLED, self.vertices, self.vertex_pieces(), self.triangles, self.triangle_pieces())
 
     def write_cloud(self, path: Path) -> None:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
-        write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces)
+        write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces())
 
     def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress) -> None:
         painter = Painter(submaps, config.voxel_size_m, config.reach_m)

@@ -10,31 +10,19 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
 from slam.frames import Intrinsics
-from slam.runtime.errors import SequenceError, sequence_errors
+from slam.runtime.errors import SequenceError
 from slam.sequences.foreign_camera import pinhole_keys, read_foreign_camera
+from slam.sequences.images import Sized
 
 DEFAULT_FPS = 10.0
 _FOV = re.compile(r"fov=(?P<fov>\d+\.?\d*)(?:,fps=(?P<fps>\d+\.?\d*))?")
 _FOV_LIMITS_DEG = (3.0, 150.0)
 
 
-class Sized(Protocol):
-    """Images of one size, pixels."""
-
-    @property
-    def width(self) -> int:
-        """Of an image."""
-
-    @property
-    def height(self) -> int:
-        """Of an image."""
-
-
-@sequence_errors()
 def find_camera_file(
     explicit: Path | None,
     *folders: Path,
@@ -55,7 +43,7 @@ def find_camera_file(
         own: reads the calibration of the recording, where it has one; not called where the user gave another.
 
     Raises:
-        SequenceError: if there is none, or it is wrong.
+        SequenceError, DataError: there is none, or it is wrong.
     """
     if explicit is not None:
         return explicit_camera(explicit, images, fps)
@@ -74,38 +62,22 @@ def find_camera_file(
     )
 
 
-@sequence_errors()
 def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> CameraFile:
-    """The camera that the user named; arguments as in `find_camera_file`.
-
-    Raises:
-        SequenceError: a file that does not exist or is wrong, or a field of view that no lens has.
-    """
+    """The camera that the user named; arguments as in `find_camera_file`."""
     if is_field_of_view(given):
         return _of_field_of_view(str(given), images, fps or DEFAULT_FPS)
     return read_explicit(given, fps)
 
 
-@sequence_errors()
 def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
-    """Read the camera file that the user named, ours or of another program; ``fps`` is for one without a rate.
-
-    Raises:
-        SequenceError: if it does not exist or is wrong.
-    """
+    """Read the camera file that the user named, ours or of another program; ``fps`` is for one without a rate."""
     if not path.is_file():
         raise SequenceError(f"no camera file {path}: give a {CAMERA_FILE}, or fov=DEGREES")
-    foreign = read_foreign_camera(path, fps or DEFAULT_FPS)
-    return read_camera_file(path) if foreign is None else foreign
+    return read_foreign_camera(path, fps or DEFAULT_FPS) or read_camera_file(path)
 
 
-@sequence_errors()
 def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile | None:
-    """The first ``camera.yaml`` found in ``folders``, or None; keys that it lacks are those of the ``own`` camera.
-
-    Raises:
-        SequenceError: if it is wrong.
-    """
+    """The first ``camera.yaml`` found in ``folders``, or None; keys that it lacks are those of the ``own`` camera."""
     path = next((folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).exists()), None)
     return None if path is None else read_camera_file(path, own)
 

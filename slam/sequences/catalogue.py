@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -30,14 +29,6 @@ PLUG_INS = "erfsfm_slam.sequences"  # entry points of other packages: each names
 
 # the first that recognises a path opens it; loaders of other packages come before these
 LOADERS: tuple[Loader, ...] = (*kitti.LOADERS, *layouts.LOADERS, folder.IMAGES, ros.LOADER, folder.VIDEO)
-
-
-@dataclass(frozen=True)
-class Found:
-    """A sequence of a data set: its kind, such as ``KITTI odometry``, and how to open it."""
-
-    kind: str
-    open: Opener
 
 
 @sequence_errors()
@@ -78,12 +69,8 @@ def open_sequence(
 
 @sequence_errors()
 def sequence_kinds(dataset: Path) -> dict[str, str]:
-    """The sequences of a data set by name, and the kind of each; empty where it is of no known kind.
-
-    Raises:
-        SequenceError: if the path does not exist.
-    """
-    return {name: found.kind for name, found in _contents(_root(dataset, None), Asked()).items()}
+    """The sequences of a data set by name, and the kind of each; empty where it is of no known kind."""
+    return {name: kind for name, (kind, _) in _contents(_root(dataset, None), Asked()).items()}
 
 
 def sequence_names(dataset: Path) -> list[str]:
@@ -119,16 +106,16 @@ def _root(dataset: Path | None, name: str | None) -> Path:
     return path
 
 
-def _contents(root: Path, asked: Asked) -> dict[str, Found]:
-    """What a path holds, pieces of one recording as one; empty where nothing is of a known kind."""
+def _contents(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
+    """Kind and opener of what a path holds, pieces of one recording as one; empty where nothing is of a known kind."""
     found = _parts(root, asked)
-    for pieces in find_series({name: each.kind for name, each in found.items()}):
-        kind, openers = found[pieces[0].name].kind, [found.pop(piece.name).open for piece in pieces]
-        found[pieces[0].name] = Found(kind, partial(open_series, pieces, openers))
+    for pieces in find_series({name: kind for name, (kind, _) in found.items()}):
+        kind, openers = found[pieces[0].name][0], [found.pop(piece.name)[1] for piece in pieces]
+        found[pieces[0].name] = kind, partial(open_series, pieces, openers)
     return found
 
 
-def _parts(root: Path, asked: Asked) -> dict[str, Found]:
+def _parts(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
     """What a path holds, or else the folders in it."""
     found = _recognised(root, asked)
     if found or root.is_file():
@@ -144,11 +131,11 @@ def _loaders() -> tuple[Loader, ...]:
     return (*map(import_plug_in, plug_ins(PLUG_INS).values()), *LOADERS)
 
 
-def _recognised(root: Path, asked: Asked) -> dict[str, Found]:
+def _recognised(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
     for loader in _loaders():
         openers = loader.find(root, asked)
         if openers:
-            return {name: Found(loader.kind, opener) for name, opener in openers.items()}
+            return {name: (loader.kind, opener) for name, opener in openers.items()}
     return {}
 
 
@@ -171,7 +158,7 @@ def _choose(root: Path, asked: Asked) -> RecordedSequence:
         raise SequenceError(
             f"no sequence {name} in {root}: found {found} under {under}; choose one of them with --sequence"
         )
-    return contents[name].open()
+    return contents[name][1]()
 
 
 def _unknown(root: Path) -> str:

@@ -29,12 +29,7 @@ _NAMED_BY_TIME = re.compile(r"(?:\D*[_-])?(\d{10})(?:[._])?(\d{3,9})")
 
 
 def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
-    """Open a folder of images in natural order, at the stamps of its ``times.txt`` or the camera's frame rate.
-
-    Raises:
-        SequenceError: if it holds none, the gaps between them are too long, or they do not fit the camera.
-        DataError: if the first image cannot be read.
-    """
+    """Open a folder of images in natural order, at the stamps of its ``times.txt`` or the camera's frame rate."""
     where = image_folder(folder)
     if where is None:
         raise SequenceError(f"no images in {folder}: looked for png, jpg, bmp there and in its sub-folders")
@@ -74,12 +69,7 @@ def _find_folder(path: Path, asked: Asked) -> dict[str, Opener]:
 
 
 def open_video(path: Path, asked: Path | None) -> RecordedSequence:
-    """Open a video, turned as its rotation flag says, at the camera's frame rate or at its own frame times.
-
-    Raises:
-        DataError: if it cannot be decoded.
-        SequenceError: if it does not fit the camera.
-    """
+    """Open a video, turned as its rotation flag says, at the camera's frame rate or at its own frame times."""
     folder = path.absolute().parent
     frames = VideoFrames(path)
     camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps)

@@ -64,11 +64,7 @@ def read_foreign_camera(path: Path, fps: float) -> CameraFile | None:
 
 
 def read_opencv_yaml(path: Path) -> Any:
-    """The content of a YAML file that OpenCV may have written, whose first line and tags are none of YAML.
-
-    Raises:
-        OSError, UnicodeDecodeError, ErfsfmError: it cannot be read.
-    """
+    """The content of a YAML file that OpenCV may have written, whose first line and tags are none of YAML."""
     text = read_text(path)
     return parse_yaml(text.partition("\n")[2].replace("!!opencv-matrix", "") if text.startswith("%") else text)
 

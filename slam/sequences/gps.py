@@ -31,9 +31,6 @@ def read_gps(path: Path) -> GpsTrack:
     CSV has a header with ``stamp`` in seconds on the clock of the images, ``latitude`` and ``longitude`` in degrees,
     ``altitude`` in metres and, optionally, ``hdop``. Of NMEA, GGA sentences are read; their stamps are seconds of the
     first day.
-
-    Raises:
-        SequenceError: the file cannot be read or holds something else, with the row.
     """
     text = text_of(path, SequenceError, "a GPS track")
     lines = text.splitlines()
@@ -51,7 +48,7 @@ def read_gps(path: Path) -> GpsTrack:
     table = np.array([fix for _, fix in found], dtype=np.float64)
     is_fix = np.isfinite(table).all(axis=1) & (abs(table[:, 1:4]) <= _MOST).all(axis=1) & (table[:, 4] > 0)
     needed = "no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed"
-    rows, table = bad.without(is_fix, needed, rows, table)
+    rows, table = bad.without([(is_fix, needed)], rows, table)
     table = table[bad.in_order(table[:, 0], "stamps", rows, "GPS fixes")]
     _require_possible_speed(table, path)
     return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4])

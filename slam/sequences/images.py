@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -19,35 +20,53 @@ _MAX_GAP_FRAMES = 100
 KITTI_PER_METRE = 256.0  # stored in depth maps
 
 
-class ImageSource(Protocol):
-    """Images of one size, read one at a time."""
+class Sized(Protocol):
+    """Images of one size, pixels."""
 
-    width: int
-    height: int
+    @property
+    def width(self) -> int:
+        """Of an image."""
+
+    @property
+    def height(self) -> int:
+        """Of an image."""
+
+
+class ImageSource(Sized, Protocol):
+    """Images of one size, read one at a time."""
 
     def __len__(self) -> int:
         """Number of images."""
 
-    def read(self, index: int) -> Image:
+    def read(self, index: int, /) -> Image:
         """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` or ``DataError`` where it cannot be read."""
+
+
+@dataclass(frozen=True)
+class ReadImages:
+    """Images that a function reads."""
+
+    width: int
+    height: int
+    count: int
+    read: Callable[[int], Image]
+
+    def __len__(self) -> int:
+        """Number of images."""
+        return self.count
 
 
 class ImageFiles:
     """Images on disk, one row a number, all of the size of the first readable ones."""
 
     def __init__(self, files: NumberedFiles) -> None:
-        """Read the first readable images for their size.
-
-        Raises:
-            DataError: if none can be read.
-            SequenceError: if a gap in the numbering is longer than 100 frames.
-        """
+        """Read the first readable images for their size."""
         self.files = files
         for first, last in files.gaps():
             if last - first + 1 > _MAX_GAP_FRAMES:
                 raise too_long(files, first, last)
         self._paths = dict(zip(files.rows, files.paths))
-        self._stretch = stretch_of(files.paths)
+        self._stretch = stretch_of(files.paths, read_values)
         self._sized_by, image = first_usual(files.paths, read_image)
         self.height, self.width = image.shape[:2]
 
@@ -87,22 +106,15 @@ def too_long(files: NumberedFiles, first: int, last: int) -> SequenceError:
     )
 
 
-@dataclass(frozen=True)
-class DepthMaps:
-    """Files by frame, the stored value of one metre, and perhaps a value other than 0 where depth is unknown."""
+def read_depth_map(path: Path, per_metre: float = KITTI_PER_METRE, unknown: int = 0) -> FloatArray:
+    """A depth map ``(h, w)`` in metres, 0 where unknown.
 
-    paths: dict[int, Path]
-    per_metre: float = KITTI_PER_METRE
-    unknown: int = 0
-
-    def read(self, index: int) -> FloatArray:
-        """The depth map ``(h, w)`` of a frame in metres.
-
-        Raises:
-            DataError: it cannot be read, or is no 16-bit grey image.
-        """
-        path = self.paths[index]
-        values = read_values(path)
-        if values.ndim != 2 or values.dtype != np.uint16:
-            raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
-        return np.where(values == self.unknown, 0, values) / self.per_metre
+    Args:
+        path: a 16-bit grey PNG.
+        per_metre: the stored value of one metre.
+        unknown: a stored value of pixels without depth, beside 0.
+    """
+    values = read_values(path)
+    if values.ndim != 2 or values.dtype != np.uint16:
+        raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
+    return np.where(values == unknown, 0, values) / per_metre

@@ -29,12 +29,12 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import DEFAULT_FPS, find_camera_file
-from slam.sequences.images import KITTI_PER_METRE, DepthMaps, ImageFiles
+from slam.sequences.images import ImageFiles, read_depth_map
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near
 from slam.sequences.recording import (
+    ArrayReader,
     RecordedSequence,
-    ScanReader,
     Source,
     read_stamps,
     require_stamps,
@@ -74,8 +74,8 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
         T_any_camera=_odometry_poses(root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0),
         usual_height_m=kitti.CAMERA_HEIGHT_M if simulated is None or asked is not None else None,
         T_camera_lidar=None if T_cam0_lidar is None else T_camera_cam0 @ T_cam0_lidar,
-        scans=_scans(folder / "velodyne", files),
-        depth_maps=_depth_maps(folder / f"depth_{number}", files),
+        scans=_readers(kitti.read_velodyne, folder / "velodyne", "*.bin", files),
+        depth_maps=_readers(read_depth_map, folder / f"depth_{number}", "*.png", files),
         distance_to_surface=None if simulated is None else _distance_to_mesh(root.base / "mesh.ply"),
     )
 
@@ -100,20 +100,13 @@ def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
         images=stored,
         camera=_camera(cameras.rectified_pinhole, number, stored, asked, *places),
         stamps=stamps,
-        sources=tuple(source.shifted(files.first) for source in drive_sources(name)),
+        sources=(Source(f"kitti_raw/{name}", first=files.first),),
         T_any_camera=_oxts_poses(drive, files, stamps, known, T_camera_lidar),
         usual_height_m=kitti.CAMERA_HEIGHT_M,
         T_camera_lidar=T_camera_lidar,
-        scans=_scans(drive / "velodyne_points/data", files),
-        depth_maps=_depth_maps(drive / _DEPTH_MAPS / f"image_{number}", files),
+        scans=_readers(kitti.read_velodyne, drive / "velodyne_points/data", "*.bin", files),
+        depth_maps=_readers(read_depth_map, drive / _DEPTH_MAPS / f"image_{number}", "*.png", files),
     )
-
-
-def drive_sources(name: str) -> tuple[Source, ...]:
-    """A raw drive's names in the leak record: its own, and that of the odometry sequence made from it."""
-    own = Source(f"kitti_raw/{name}")
-    cut = ((sequence, first, stop) for sequence, (drive, first, stop) in kitti.ODOMETRY_DRIVES.items() if drive == name)
-    return own, *(Source(f"kitti_odometry/{s}", first=-first, length=stop - first) for s, first, stop in cut)
 
 
 def _camera(
@@ -235,19 +228,12 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
     return se3.make(R_world_imu.as_matrix(), positions)
 
 
-def _scans(folder: Path, files: NumberedFiles) -> dict[int, ScanReader]:
-    """The LiDAR scans of a folder by frame."""
-    return {row: partial(kitti.read_velodyne, path) for row, path in _by_row(folder, "*.bin", files).items()}
-
-
-def _depth_maps(folder: Path, files: NumberedFiles) -> DepthMaps | None:
-    paths = _by_row(folder, "*.png", files)
-    return DepthMaps(paths, KITTI_PER_METRE) if paths else None
-
-
-def _by_row(folder: Path, pattern: str, files: NumberedFiles) -> dict[int, Path]:
-    """The files of a folder by frame, by the numbers of the images."""
-    return {int(path.stem) - files.first: path for path in folder.glob(pattern) if path.stem.isdecimal()}
+def _readers(
+    read: Callable[[Path], FloatArray], folder: Path, pattern: str, files: NumberedFiles
+) -> dict[int, ArrayReader]:
+    """Readers of the files of a folder by frame, by the numbers of the images."""
+    paths = (path for path in folder.glob(pattern) if path.stem.isdecimal())
+    return {int(path.stem) - files.first: partial(read, path) for path in paths}
 
 
 def _distance_to_mesh(path: Path) -> Callable[[FloatArray], FloatArray] | None:

@@ -23,24 +23,24 @@ from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import has_images, list_images
 from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
-from slam.formats.rows import BadRows, in_seconds, number_or_nan, text_of
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
 from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, find_camera_file, read_explicit
 from slam.sequences.foreign_camera import pinhole_keys, read_opencv_yaml
-from slam.sequences.images import DepthMaps, ImageFiles
+from slam.sequences.images import ImageFiles, read_depth_map
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import pose_files, poses_near, poses_of
-from slam.sequences.recording import RecordedSequence, ScanReader, Source, read_stamps, require_stamps
+from slam.sequences.poses import pose_files, poses_near, poses_of, read_matrix
+from slam.sequences.recording import ArrayReader, RecordedSequence, Source, read_stamps, require_stamps
 
 logger = logging.getLogger(__name__)
 
 _NEAR_S = 0.05  # of a LiDAR scan to its image
 _NEAR_DEPTH_S = 0.02
 _FPS = 30.0  # of the cameras of 7-Scenes and ScanNet
-_MILLIMETRES, _TUM_PER_METRE = 1000.0, 5000.0
+_TUM_PER_METRE = 5000.0
 _SEVEN_SCENES_UNKNOWN = 65535
 _RIGID_TOLERANCE = 0.01
 _EUROC_CAMERAS = ("cam0", "cam1")
@@ -66,18 +66,9 @@ def _recorded(
     first: int = 0,
     **beside_images: Any,
 ) -> RecordedSequence:
-    """A recording of image files.
+    """A recording of image files, the ``first`` of them by the data set's own numbers.
 
-    Args:
-        data_set: how the leak record calls it.
-        name: of the recording.
-        files: its images.
-        stamps: seconds ``(N,)``.
-        asked: the camera that the user gave, if any.
-        places: where a ``camera.yaml`` may lie.
-        own: the data set's calibration, if any.
-        first: number of the first image in the data set.
-        beside_images: further arguments of `RecordedSequence`.
+    ``places`` may have a ``camera.yaml``; ``own`` reads the calibration of the data set.
     """
     stored = ImageFiles(files)
     calibration = None if own is None else partial(own, stored)
@@ -87,20 +78,12 @@ def _recorded(
 
 
 def _index(table: Path, folder: Path, in_nanoseconds: bool = False) -> tuple[FloatArray, list[Path]]:
-    """Stamps in seconds and files of a table of both, good rows in the order of time.
-
-    Args:
-        table: words separated by white space or commas, ``#`` before comments.
-        folder: that its files are in.
-        in_nanoseconds: whatever the number of digits.
-    """
+    """Stamps in seconds and files, which are in ``folder``, of a table of both, good rows in the order of time."""
     wanted = "'nanoseconds,file'" if in_nanoseconds else "'stamp file'"
     bad = BadRows(table, SequenceError)
     rows: list[tuple[int, float, Path]] = []
-    for number, line in enumerate(text_of(table, SequenceError, f"rows of {wanted}").splitlines(), start=1):
-        words = line.replace(",", " ").split()
-        if not words or line.startswith("#"):
-            continue
+    for number, line in rows_of(table, SequenceError, f"rows of {wanted}"):
+        words = line.replace(",", " ").split() or [""]
         is_whole = in_nanoseconds and words[0].isdecimal()
         stamp = int(words[0]) / 10**9 if is_whole else number_or_nan(in_seconds(words[0]))
         if len(words) == 2 and math.isfinite(stamp):
@@ -112,10 +95,9 @@ def _index(table: Path, folder: Path, in_nanoseconds: bool = False) -> tuple[Flo
     return stamps[order], [rows[k][2] for k in order]
 
 
-def _depth_maps(paths: list[Path], per_metre: float, unknown: int = 0) -> DepthMaps | None:
-    """Of the frames whose files are there; None where there are none."""
-    found = {row: path for row, path in enumerate(paths) if path.is_file()}
-    return DepthMaps(found, per_metre, unknown) if found else None
+def _depth_maps(paths: list[Path], unknown: int = 0) -> dict[int, ArrayReader]:
+    """In millimetres, of the frames whose files are there."""
+    return {k: partial(read_depth_map, path, 1000.0, unknown) for k, path in enumerate(paths) if path.is_file()}
 
 
 def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:
@@ -206,10 +188,11 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
     own: OwnCamera | None = None
     if match is not None and beside(*places) is None:
         own = lambda _: _FREIBURG_CAMERAS[match["camera"]]  # noqa: E731
-    depth_maps = None
+    depth_maps = {}
     if (folder / _TUM_DEPTH).exists():
         known, paths = _index(folder / _TUM_DEPTH, folder)
-        depth_maps = DepthMaps({k: paths[row] for k, row in _near(stamps, known, _NEAR_DEPTH_S)}, _TUM_PER_METRE)
+        near = _near(stamps, known, _NEAR_DEPTH_S)
+        depth_maps = {k: partial(read_depth_map, paths[row], _TUM_PER_METRE) for k, row in near}
     truth = _truth(folder / "groundtruth.txt", stamps)
     return _recorded("tum", folder.name, files, stamps, asked, places, own, T_any_camera=truth, depth_maps=depth_maps)
 
@@ -272,9 +255,7 @@ def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
         lambda _: CameraFile(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS),
         numbers[0],
         T_any_camera=pose_files([frame.with_suffix(".pose.txt") for frame in frames], stamps),
-        depth_maps=_depth_maps(
-            [frame.with_suffix(".depth.png") for frame in frames], _MILLIMETRES, _SEVEN_SCENES_UNKNOWN
-        ),
+        depth_maps=_depth_maps([frame.with_suffix(".depth.png") for frame in frames], _SEVEN_SCENES_UNKNOWN),
     )
 
 
@@ -301,7 +282,7 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
         partial(_scannet_camera, folder / _SCANNET_CAMERA),
         numbers[0],
         T_any_camera=pose_files([folder / "pose" / f"{k}.txt" for k in numbers], stamps),
-        depth_maps=_depth_maps([folder / "depth" / f"{k}.png" for k in numbers], _MILLIMETRES),
+        depth_maps=_depth_maps([folder / "depth" / f"{k}.png" for k in numbers]),
     )
 
 
@@ -309,10 +290,7 @@ _SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
 
 
 def _scannet_camera(path: Path, images: ImageFiles) -> CameraFile:
-    try:
-        K = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path} must hold the 4 x 4 numbers of a camera: {error}") from error
+    K = read_matrix(path, "a camera")
     pinhole = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     return camera_of(pinhole_keys(images.width, images.height, *pinhole, fps=_FPS), str(path))
 
@@ -336,7 +314,7 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         height_m = float(T_ego_camera[2, 3])
         size = front[0]["width"], front[0]["height"]
         keys = pinhole_keys(*size, fx, fy, cx, cy, fps=_NUSCENES_FPS, camera_height_m=height_m)
-        scans: dict[int, ScanReader] = {}
+        scans: dict[int, ArrayReader] = {}
         T_camera_lidar = None
         if lidar:
             (T_ego_lidar,) = _nuscenes_poses([mounts[lidar[0]["calibrated_sensor_token"]]])

@@ -88,22 +88,24 @@ def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(T_any_camera).all(axis=(1, 2)))
 
 
+def read_matrix(path: Path, what: str) -> FloatArray:
+    """A file of 4 x 4 numbers, which describe what it says."""
+    try:
+        return np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{path} must hold the 4 x 4 numbers of {what}: {error}") from error
+
+
 def pose_files(paths: list[Path], stamps: FloatArray) -> FloatArray | None:
     """`poses_near` of files of 4 x 4 numbers, one an image, some of which may be missing; None where all are.
 
     Numbers that are not finite are those of a camera that lost track.
-
-    Raises:
-        SequenceError: a file holds other than 16 numbers, or no pose.
     """
     known, poses = [], []
     for stamp, path in zip(stamps, paths):
         if not path.exists():
             continue
-        try:
-            pose = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
-        except (OSError, ValueError) as error:
-            raise SequenceError(f"{path} must hold the 4 x 4 numbers of a pose: {error}") from error
+        pose = read_matrix(path, "a pose")
         if not np.isfinite(pose).all():
             continue
         if not se3.is_se3(pose, _ROTATION_TOLERANCE):
@@ -120,10 +122,6 @@ def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
 
     Rows with stamps belong to the frames of these times, rows with frame numbers to these frames, and others to the
     frames one by one; NaN where unknown.
-
-    Raises:
-        SequenceError: the rows are not of its frames.
-        TrajectoryError: the file cannot be read.
     """
     truth, frames = read_trajectory(path), len(stamps)
     numbers = truth.frame_numbers

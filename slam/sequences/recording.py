@@ -12,20 +12,21 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import InitVar, dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.formats.rows import BadRows, in_seconds, number_or_nan, text_of
-from slam.frames import Frame, Intrinsics
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
+from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
 from slam.sequences.gps import FASTEST_M_S
-from slam.sequences.images import DepthMaps, ImageFiles, ImageSource, too_long
+from slam.sequences.images import ImageFiles, ImageSource, ReadImages, too_long
 from slam.sequences.poses import known_poses, rebased
-from slam.sequences.undistortion import UndistortedImages, Undistortion, calibrated
+from slam.sequences.undistortion import Undistortion, require_size, undistorted
 
 logger = logging.getLogger(__name__)
 
@@ -34,7 +35,7 @@ POSSIBLE_PERIODS_S = (1e-5, 1e4)  # stamps in nanoseconds or microseconds give m
 _USUAL_PERIODS_S = (1e-3, 5.0)
 _RIGID_TOLERANCE = 0.01
 _LONG_PAUSE_S, _LONG_PAUSE_PERIODS = 30.0, 50.0
-ScanReader = Callable[[], FloatArray]  # the points (P, 3) of a LiDAR scan, metres, in the LiDAR
+ArrayReader = Callable[[], NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,9 @@ class RecordedSequence:
     """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``.
 
     ``camera`` took the images as they are stored: where its lens is distorted they are undistorted as they are read,
-    and ``depth_maps``, the true depth beside the stored images, are left out. ``usual_height_m`` is the height of a
-    camera that does not say its own. ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown;
+    and ``depth_maps``, the true depth ``(h, w)`` in metres beside the stored images, 0 where unknown, are left out.
+    ``scans`` are the points ``(P, 3)`` of the LiDAR, metres, in its frame. ``usual_height_m`` is the height of a camera
+    that does not say its own. ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown;
     ``reference`` follows from them where all are known. ``distance_to_surface`` gives the distance of points ``(M, 3)``
     of that world to the true surface, where the whole of it is known. Frame 0 is frame ``start`` of the ``recorded``
     ones, by which images, scans and depth maps are numbered.
@@ -77,22 +79,23 @@ class RecordedSequence:
 
     name: str
     images: ImageSource
-    camera: InitVar[CameraFile | Intrinsics]
+    camera: CameraFile | Intrinsics
     stamps: FloatArray
     sources: tuple[Source, ...]
     T_any_camera: FloatArray | None = None
     usual_height_m: InitVar[float | None] = None
     T_camera_lidar: FloatArray | None = None
-    scans: dict[int, ScanReader] = field(default_factory=dict)
-    depth_maps: DepthMaps | None = None
+    scans: dict[int, ArrayReader] = field(default_factory=dict)
+    depth_maps: dict[int, ArrayReader] = field(default_factory=dict)
     distance_to_surface: Callable[[FloatArray], FloatArray] | None = None
     intrinsics: Intrinsics = field(init=False)
+    undistortion: Undistortion | None = field(default=None, init=False)
     camera_height_m: float | None = field(init=False)
     reference: FloatArray | None = field(default=None, init=False)
     start: int = field(default=0, init=False)
     recorded: int = field(init=False)
 
-    def __post_init__(self, camera: CameraFile | Intrinsics, usual_height_m: float | None) -> None:
+    def __post_init__(self, usual_height_m: float | None) -> None:
         """Check images, camera and stamps against each other, and rebase the poses.
 
         Raises:
@@ -103,12 +106,13 @@ class RecordedSequence:
         if isinstance(self.images, ImageFiles):
             require_short_gaps(self.images.files, self.stamps)
             where = f"{self.name} in {self.images.files.paths[0].parent}"
-        if isinstance(camera, CameraFile):
-            self.images, self.intrinsics = calibrated(self.images, camera, where)
-            self.camera_height_m = camera.height_or(usual_height_m)
-            self.depth_maps = None if camera.is_distorted else self.depth_maps
+        if isinstance(self.camera, CameraFile):
+            require_size(self.images, self.camera, where)
+            self.intrinsics, self.undistortion = undistorted(self.camera)
+            self.camera_height_m = self.camera.height_or(usual_height_m)
+            self.depth_maps = self.depth_maps if self.undistortion is None else {}
         else:
-            self.intrinsics, self.camera_height_m = camera, usual_height_m
+            self.intrinsics, self.camera_height_m = self.camera, usual_height_m
         _require_plausible_rate(self.name, self.stamps)
         if self.T_camera_lidar is not None and not is_se3(self.T_camera_lidar, _RIGID_TOLERANCE):
             raise SequenceError(f"{self.name}: the calibration of its LiDAR is no rotation and translation")
@@ -116,11 +120,7 @@ class RecordedSequence:
         self.take_truth(self.T_any_camera)
 
     def cut(self, start: int, stop: int) -> Self:
-        """The frames [start, stop) as a sequence of their own; stamps stay, poses begin at the identity.
-
-        Raises:
-            SequenceError: unless 0 <= start < stop <= len(self).
-        """
+        """The frames [start, stop) as a sequence of their own; stamps stay, poses begin at the identity."""
         if not 0 <= start < stop <= len(self):
             raise SequenceError(f"no frames {start}:{stop} in sequence {self.name}: it has {len(self)}")
         part = copy(self)
@@ -129,11 +129,6 @@ class RecordedSequence:
         part.T_any_camera = None if self.T_any_camera is None else self.T_any_camera[start:stop]
         part.reference = self.true_poses(start, stop)
         return part
-
-    @property
-    def undistortion(self) -> Undistortion | None:
-        """What is done with the images as they are read; None where they have no distortion."""
-        return self.images.undistortion if isinstance(self.images, UndistortedImages) else None
 
     def take_truth(self, T_any_camera: FloatArray | None) -> None:
         """Let these be the true poses."""
@@ -156,18 +151,17 @@ class RecordedSequence:
         if not 0 <= index < len(self):
             raise SequenceError(f"no frame {index} in sequence {self.name}: it has frames 0 to {len(self) - 1}")
         with sequence_errors():
-            return Frame(index, float(self.stamps[index]), self.images.read(self.start + index))
+            image = self.images.read(self.start + index)
+        if self.undistortion is not None:
+            image = self.undistortion.apply(image)
+        return Frame(index, float(self.stamps[index]), image)
 
     def has_scan(self, index: int) -> bool:
         """Whether a LiDAR scan was taken with a frame."""
         return self.start + index in self.scans
 
     def scan(self, index: int) -> FloatArray:
-        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR.
-
-        Raises:
-            SequenceError: there is none, or it cannot be read.
-        """
+        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR."""
         if not self.has_scan(index):
             raise SequenceError(f"frame {index} of {self.name} has no scan")
         with sequence_errors():
@@ -182,19 +176,12 @@ class RecordedSequence:
 
     def true_depth_frames(self) -> list[int]:
         """Frames with a depth map beside their image."""
-        paths = {} if self.depth_maps is None else self.depth_maps.paths
-        return [k for k in range(len(self)) if self.start + k in paths]
+        return [k for k in range(len(self)) if self.start + k in self.depth_maps]
 
     def true_depth(self, index: int) -> FloatArray:
-        """The depth map ``(h, w)`` beside an image in metres, 0 where unknown.
-
-        Raises:
-            SequenceError: it cannot be read.
-        """
-        if self.depth_maps is None:
-            raise SequenceError(f"{self.name} has no depth maps")
+        """The depth map ``(h, w)`` beside an image in metres, 0 where unknown."""
         with sequence_errors():
-            return self.depth_maps.read(self.start + index)
+            return np.asarray(self.depth_maps[self.start + index](), np.float64)
 
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""
@@ -202,35 +189,15 @@ class RecordedSequence:
         return tuple(label for label in labels if label is not None)
 
 
-@dataclass
-class GrowingSequence:
+class GrowingSequence(RecordedSequence):
     """A sequence that grows by a frame at a time; its images are not kept."""
 
-    intrinsics: Intrinsics
-    camera_height_m: float | None
-    stamps: FloatArray = field(default_factory=lambda: np.zeros(0))
-    name: str = "live"
-    reference: FloatArray | None = None
-    T_camera_lidar: FloatArray | None = None
+    def __init__(self, intrinsics: Intrinsics, camera_height_m: float | None, name: str = "live") -> None:
+        def forgotten(index: int) -> Image:
+            raise SlamError(f"frame {index} of a live drive is not kept")
 
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def frame(self, index: int) -> Frame:
-        """Always ``SlamError``: images are not kept."""
-        raise SlamError(f"frame {index} of a live drive is not kept")
-
-    def has_scan(self, index: int) -> bool:
-        """False: there are no scans."""
-        return False
-
-    def scan(self, index: int) -> FloatArray:
-        """Always ``SlamError``: there are no scans."""
-        raise SlamError(f"frame {index} of a live drive has no scan")
-
-    def provenance(self) -> tuple[str, ...]:
-        """Unknown."""
-        return ()
+        images = ReadImages(intrinsics.width, intrinsics.height, 0, forgotten)
+        super().__init__(name, images, intrinsics, np.zeros(0), (), usual_height_m=camera_height_m)
 
 
 def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
@@ -264,9 +231,6 @@ def frame_range(text: str, frames: int) -> tuple[int, int]:
     """Read ``A:B`` as Python reads a slice of so many frames: half-open, either end optional or negative.
 
     Unlike in Python, an end beyond the sequence is an error.
-
-    Raises:
-        SequenceError: if the text is no range, or the range is empty or reaches outside the sequence.
     """
     try:
         begin, end = text.split(":")
@@ -290,14 +254,9 @@ def uniform_stamps(frames: int, fps: float) -> FloatArray:
 
 
 def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
-    """A file with one time in seconds a row, perhaps after a number or a name, checked by `require_stamps`.
-
-    Raises:
-        SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
-    """
-    text = text_of(path, SequenceError, "one time in seconds a row")
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line.strip())] for line in lines]
+    """A file with one time in seconds a row, perhaps after a number or a name, checked by `require_stamps`."""
+    lines = rows_of(path, SequenceError, "one time in seconds a row")
+    rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line)] for _, line in lines]
     has_header = files.rows_of(len(rows)) is None and files.rows_of(len(rows) - 1) is not None
     rows = rows[has_header:]
     first, second = (np.array([row[k] if k < len(row) else np.nan for row in rows]) for k in (0, 1))
@@ -335,7 +294,7 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
 
 def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     bad, rows = BadRows(path, SequenceError), np.arange(1, len(stamps) + 1)
-    rows, times = bad.without(np.isfinite(stamps), "not a time in seconds", rows, stamps)
+    rows, times = bad.without([(np.isfinite(stamps), "not a time in seconds")], rows, stamps)
     wanted = "times in seconds that increase, one a row"
     order = bad.in_order(times, "stamps", rows, wanted)
     if len(order) == 1:

@@ -16,9 +16,9 @@ import numpy as np
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.images import ImageSource
+from slam.sequences.images import ReadImages
 from slam.sequences.loader import Opener
-from slam.sequences.recording import RecordedSequence, ScanReader
+from slam.sequences.recording import RecordedSequence
 
 logger = logging.getLogger(__name__)
 
@@ -83,29 +83,11 @@ def find_series(kinds: Mapping[str, str]) -> list[list[Piece]]:
     return found
 
 
-class _JoinedImages:
-    """The images of several sources, one after the other."""
-
-    def __init__(self, sources: Sequence[ImageSource], ends: FloatArray) -> None:
-        self._sources, self._ends = sources, ends
-        self.width, self.height = sources[0].width, sources[0].height
-
-    def __len__(self) -> int:
-        return int(self._ends[-1])
-
-    def read(self, index: int) -> Image:
-        place = int(np.searchsorted(self._ends, index, side="right"))
-        return self._sources[place].read(index - (int(self._ends[place - 1]) if place else 0))
-
-
 def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedSequence:
     """Pieces as one recording, at their own stamps where those go on, else one after the other.
 
     A piece that is missing between two others is a gap, as long as its name says or as the piece before. Clips much
     shorter than the regular distance of their names follow each other: their names do not tell when they begin.
-
-    Raises:
-        SequenceError, DataError: a piece cannot be opened, or is of another camera.
     """
     parts = [opener() for opener in openers]
     first = parts[0]
@@ -119,13 +101,15 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
     ends = np.cumsum([len(part) for part in parts])
     starts = [0, *ends[:-1].tolist()]
     poses = [np.full((len(part), 4, 4), np.nan) if part.T_any_camera is None else part.T_any_camera for part in parts]
-    scans: dict[int, ScanReader] = {}
-    for start, part in zip(starts, parts):
-        scans |= {start + k: read for k, read in part.scans.items()}
+
+    def read(index: int) -> Image:
+        place = int(np.searchsorted(ends, index, side="right"))
+        return parts[place].images.read(index - starts[place])
+
     return RecordedSequence(
         name=pieces[0].name,
-        images=_JoinedImages([part.images for part in parts], ends),
-        camera=first.intrinsics,
+        images=ReadImages(first.images.width, first.images.height, int(ends[-1]), read),
+        camera=first.camera,
         stamps=_stamps(pieces, [part.stamps for part in parts]),
         sources=tuple(
             replace(source, first=(source.first or 0) - start, length=(source.first or 0) + len(part))
@@ -135,7 +119,7 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
         T_any_camera=np.concatenate(poses) if any(part.T_any_camera is not None for part in parts) else None,
         usual_height_m=first.camera_height_m,
         T_camera_lidar=first.T_camera_lidar,
-        scans=scans,
+        scans={start + k: scan for start, part in zip(starts, parts) for k, scan in part.scans.items()},
     )
 
 

@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
 from slam.frames import DepthMap, Image, Intrinsics, sampled_depth
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.images import ImageSource
+from slam.sequences.images import Sized
 
 logger = logging.getLogger(__name__)
 
@@ -32,11 +31,7 @@ class Undistortion:
     """
 
     def __init__(self, camera: CameraFile) -> None:
-        """Build the look-up maps.
-
-        Raises:
-            SequenceError: if the coefficients fold the image over itself.
-        """
+        """Build the look-up maps."""
         self._K = Intrinsics.of(camera.pinhole).K
         self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
         self._model = camera.model
@@ -55,14 +50,12 @@ class Undistortion:
         self.intrinsics = Intrinsics(
             camera.width, camera.height, *focal, camera.cx, camera.cy, undistorted=True, readout_s=readout_s
         )
-        self._maps = self._look_up()
+        pixels = self.intrinsics.pixel_grid()
+        seen = self.distort(pixels.reshape(-1, 2), self.intrinsics.K).astype(np.float32).reshape(pixels.shape)
+        self._maps = np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
 
     def apply(self, image: Image) -> Image:
-        """Undistort an image ``(H, W, 3)``.
-
-        Raises:
-            SequenceError: it has another size than the camera.
-        """
+        """Undistort an image ``(H, W, 3)``."""
         camera, (height, width) = self.intrinsics, image.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise SequenceError(
@@ -96,18 +89,6 @@ class Undistortion:
         bent = np.arctan(2 * radius * np.tan(angle / 2)) / angle
         return np.asarray(rays * bent / np.maximum(radius, 1e-12))
 
-    def _look_up(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The distorted u and v ``(H, W)`` of each pixel of the pinhole image."""
-        camera = self.intrinsics
-        size = (camera.width, camera.height)
-        if self._model == "fov":
-            seen = self.distort(camera.pixel_grid().reshape(-1, 2), camera.K).astype(np.float32)
-            u, v = np.moveaxis(seen.reshape(camera.height, camera.width, 2), -1, 0)
-            return np.ascontiguousarray(u), np.ascontiguousarray(v)
-        build = cv2.fisheye.initUndistortRectifyMap if self._model == "fisheye" else cv2.initUndistortRectifyMap
-        u, v = build(self._K, self._coefficients, np.eye(3), camera.K, size, cv2.CV_32FC1)
-        return u, v
-
     def _shortest_zoom(self, width: int, height: int) -> float:
         """Zoom out from the centre until the border of the pinhole image meets that of the lens's image."""
         border = _border(width, height)
@@ -129,57 +110,28 @@ class Undistortion:
         return zoom * _ZOOM_STEP
 
 
-class UndistortedImages:
-    """An image source seen through an ``Undistortion``."""
+def require_size(images: Sized, camera: CameraFile, where: str) -> None:
+    """Refuse images of another size than their camera."""
+    if (images.width, images.height) == (camera.width, camera.height):
+        return
+    wanted = (
+        "they are turned by a quarter, perhaps by their own metadata: turn them back"
+        if (images.width, images.height) == (camera.height, camera.width)
+        else "resize the images, or if they were only resized, scale the "
+        f"file to {{{_scaled_hint(camera, images.width, images.height)}}}"
+    )
+    raise SequenceError(
+        f"the images of {where} are {images.width}x{images.height}, but the camera file is for "
+        f"{camera.width}x{camera.height}: {wanted}"
+    )
 
-    def __init__(self, images: ImageSource, undistortion: Undistortion) -> None:
-        self._images = images
-        self.undistortion = undistortion
-        self.width, self.height = images.width, images.height
 
-    def __len__(self) -> int:
-        """Number of images."""
-        return len(self._images)
-
-    def read(self, index: int) -> Image:
-        """One undistorted image ``(height, width, 3)`` uint8 RGB."""
-        return self.undistortion.apply(self._images.read(index))
-
-
-def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[ImageSource, Intrinsics]:
-    """Undistorted images and their pinhole camera.
-
-    Raises:
-        SequenceError: if the images have another size than the camera, or its lens cannot be undistorted.
-    """
-    if (images.width, images.height) != (camera.width, camera.height):
-        wanted = (
-            "they are turned by a quarter, perhaps by their own metadata: turn them back"
-            if (images.width, images.height) == (camera.height, camera.width)
-            else "resize the images, or if they were only resized, scale the "
-            f"file to {{{_scaled_hint(camera, images.width, images.height)}}}"
-        )
-        raise SequenceError(
-            f"the images of {where} are {images.width}x{images.height}, but the camera file is for "
-            f"{camera.width}x{camera.height}: {wanted}"
-        )
-    if not camera.is_distorted:
-        return images, pinhole_of(camera)
-    try:
+def undistorted(camera: CameraFile) -> tuple[Intrinsics, Undistortion | None]:
+    """The camera of images after their distortion is taken out, and what takes it out; None where there is none."""
+    if camera.is_distorted:
         undistortion = Undistortion(camera)
-    except SequenceError as error:
-        raise SequenceError(f"{where}: {error}") from error
-    return UndistortedImages(images, undistortion), undistortion.intrinsics
-
-
-def pinhole_of(camera: CameraFile) -> Intrinsics:
-    """The camera of images without distortion."""
-    return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3)
-
-
-def intrinsics_of(camera: CameraFile) -> Intrinsics:
-    """The camera of images as they are after their distortion, if any, was taken out."""
-    return Undistortion(camera).intrinsics if camera.is_distorted else pinhole_of(camera)
+        return undistortion.intrinsics, undistortion
+    return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3), None
 
 
 def _scaled_hint(camera: CameraFile, width: int, height: int) -> str:

@@ -27,12 +27,11 @@ from erfsfm.common.errors import ErfsfmError
 from slam import Slam
 from slam.config.sections import load_config
 from slam.formats.trajectory import write_tum
-from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SlamError
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.ros.messages import camera_file_of, image_of, is_rectified
-from slam.sequences.undistortion import Undistortion
+from slam.sequences.undistortion import Undistortion, undistorted
 
 T_MAP_WORLD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # without a base
 STRIDE = 2  # pixels of the kept depth
@@ -91,8 +90,7 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         if self._slam is None:
             rectified = is_rectified(self.resolve_topic_name("image"))
             camera = camera_file_of(info, rectified, DEFAULT_FPS, "camera_info")
-            self._undistortion = None if camera.model == "pinhole" else Undistortion(camera)
-            intrinsics = self._undistortion.intrinsics if self._undistortion else Intrinsics.of(camera.pinhole)
+            intrinsics, self._undistortion = undistorted(camera)
             config = load_config(None, self._of["settings"].split())
             height_m = self._of["camera_height_m"] or None
             self._slam = Slam.from_weights(self._of["weights"], intrinsics, config, height_m, with_map=True)

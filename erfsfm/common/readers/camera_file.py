@@ -88,9 +88,6 @@ def read_camera_file(path: Path, own: Mapping[str, Any] | None = None) -> Camera
     """Read and check a ``camera.yaml``; an unlikely camera is logged as a warning.
 
     Keys that it lacks are those of the recording's ``own`` camera, if any.
-
-    Raises:
-        DataError: naming the file and the key that is missing, unknown, written twice or wrong.
     """
     try:
         content = read_yaml(path)

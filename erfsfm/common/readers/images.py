@@ -114,18 +114,6 @@ class Stretch:
         return np.asarray(np.clip(np.rint(scaled), 0, 255), np.uint8)
 
 
-def stretch_of(paths: Sequence[Path]) -> Stretch | None:
-    """The stretch of a recording's image files, by some of them; None where they have eight bits."""
-    seen = []
-    for path in paths[:: max(len(paths) // _STRETCHED_BY, 1)]:
-        with suppress(DataError):
-            values = read_values(path)
-            if values.dtype != np.uint16:
-                return None
-            seen.append(values)
-    return Stretch.of(seen) if seen else None
-
-
 def read_image(path: Path, stretch: Stretch | None = None) -> Image:
     """Read an image as ``(H, W, 3)`` uint8 RGB; grey is repeated to three channels.
 
@@ -138,33 +126,48 @@ def read_image(path: Path, stretch: Stretch | None = None) -> Image:
 
 
 def decode_image(data: bytes, where: str, stretch: Stretch | None = None) -> Image:
-    """As `read_image`, of the bytes of a file; ``where`` they come from is for messages.
-
-    Raises:
-        DataError: empty, truncated or no image; one line.
-    """
-    _require_complete(data, where)
-    if data.startswith(_PNG_START) and data[_PNG_BIT_DEPTH] == 16:
-        values = _decode(where, data, cv2.IMREAD_UNCHANGED)
+    """As `read_image`, of the bytes of a file; ``where`` they come from is for messages."""
+    if data.startswith(_PNG_START) and data[_PNG_BIT_DEPTH : _PNG_BIT_DEPTH + 1] == b"\x10":
+        values = decode_values(data, where)
         grey_or_colour = np.atleast_3d(values)[..., :3]  # without alpha
         picture = (stretch or Stretch.of([values])).apply(grey_or_colour)
         return np.ascontiguousarray(np.broadcast_to(picture[..., ::-1], (*values.shape[:2], 3)))
-    return np.asarray(cv2.cvtColor(_decode(where, data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    colour = decode_values(data, where, cv2.IMREAD_COLOR)
+    return np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def read_values(path: Path) -> NDArray[Any]:
-    """An image's values as stored, such as a 16-bit depth map ``(H, W)``.
-
-    Raises:
-        DataError: missing, empty, truncated or no image; one line.
-    """
+    """An image's values as stored, such as a 16-bit depth map ``(H, W)``; errors as of `read_image`."""
     return decode_values(_file_bytes(path), f"image {path}")
 
 
-def decode_values(data: bytes, where: str) -> NDArray[Any]:
-    """As `read_values`, of the bytes of a file; ``where`` they come from is for messages."""
-    _require_complete(data, where)
-    return _decode(where, data, cv2.IMREAD_UNCHANGED)
+def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+    """As `read_values`, of the bytes of a file; ``where`` they come from is for messages, ``flags`` are OpenCV's."""
+    if not data:
+        raise DataError(f"{where} is empty: copy it again")
+    if not _is_complete(data):
+        raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        if "MAX_IMAGE_PIXELS" in str(error):
+            raise DataError(f"{where} has more pixels than any camera: resize it, or leave it out") from error
+        raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
+    if image is None:
+        raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")
+    return np.asarray(image)
+
+
+def stretch_of(places: Sequence[T], read: Callable[[T], NDArray[Any]]) -> Stretch | None:
+    """The stretch of a recording by some of its images, whose values are read; None where they have eight bits."""
+    seen = []
+    for place in places[:: max(len(places) // _STRETCHED_BY, 1)]:
+        with suppress(OneLineError):
+            values = read(place)
+            if values.dtype != np.uint16:
+                return None
+            seen.append(values)
+    return Stretch.of(seen) if seen else None
 
 
 def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:
@@ -213,39 +216,16 @@ def _file_bytes(path: Path) -> bytes:
         raise DataError(f"cannot read image {path}: {error.strerror}") from error
 
 
-def _require_complete(data: bytes, where: str) -> None:
-    if not data:
-        raise DataError(f"{where} is empty: copy it again")
-    if not _is_complete(data):
-        raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
-
-
 def _is_complete(data: bytes) -> bool:
-    """Whether a JPEG or PNG file reaches its end marker; some decoders fill what is missing with grey."""
-    if data.startswith(_JPEG_START):
-        return _jpeg_is_complete(data)
+    """Whether a JPEG or PNG file reaches its end marker; some decoders fill what is missing with grey.
+
+    The segments of a JPEG lead there; phones put a video behind it, with bytes of any value.
+    """
     if data.startswith(_PNG_START):
         return data.rfind(_PNG_END) > 0
-    return True
-
-
-def _jpeg_is_complete(data: bytes) -> bool:
-    """Whether its segments lead to the end marker; phones put a video behind that, with bytes of any value."""
     place = len(_JPEG_START)
-    while found := _JPEG_SEGMENT.search(data, place):
+    while data.startswith(_JPEG_START) and (found := _JPEG_SEGMENT.search(data, place)):
         if found[0] == _JPEG_END:
             return True
         place = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
-    return False
-
-
-def _decode(where: str, data: bytes, flags: int) -> NDArray[Any]:
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        if "MAX_IMAGE_PIXELS" in str(error):
-            raise DataError(f"{where} has more pixels than any camera: resize it, or leave it out") from error
-        raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
-    if image is None:
-        raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")
-    return np.asarray(image)
+    return not data.startswith(_JPEG_START)

@@ -63,11 +63,7 @@ class OdometryRoot:
         return [folder.name for folder in self.folders() if odometry_camera(folder) is not None]
 
     def simulation_seed(self) -> int | None:
-        """The seed of a simulated world; None of a real root.
-
-        Raises:
-            DataError: the file that has the seed is damaged.
-        """
+        """The seed of a simulated world; None of a real root."""
         path = self.base / SIMULATION_FILE
         if not path.is_file():
             return None
@@ -140,11 +136,7 @@ class CalibrationFile:
     """The numeric rows of one calibration file."""
 
     def __init__(self, path: Path) -> None:
-        """Read a file.
-
-        Raises:
-            DataError: it is missing or cannot be read.
-        """
+        """Read a file."""
         self.path = path
         if not path.is_file():
             shipped = _SHIPPED.get(path.name)
@@ -161,11 +153,7 @@ class CalibrationFile:
         return key in self._rows
 
     def matrix(self, key: str, shape: tuple[int, ...]) -> FloatArray:
-        """The numbers of a row, row-major.
-
-        Raises:
-            DataError: the row is missing, has another count of numbers, or holds something else.
-        """
+        """The numbers of a row, row-major."""
         count = int(np.prod(shape))
         words = self._rows.get(key)
         if words is None:
@@ -194,9 +182,6 @@ class CalibrationFile:
         """The camera of a projection matrix of ``calib.txt``, for images of the given size.
 
         The file has no image size: it is that of the images where the principal point is near their middle.
-
-        Raises:
-            DataError: no pinhole, an impossible one, or one of images of another size.
         """
         camera = self._pinhole(key, width, height)
         scales = 2 * (camera.cx + 0.5) / width, 2 * (camera.cy + 0.5) / height
@@ -212,11 +197,7 @@ class CalibrationFile:
         return camera
 
     def rectified_pinhole(self, camera: str, width: int, height: int) -> Pinhole:
-        """A camera (``"02"``) of ``calib_cam_to_cam.txt``, for images resized to the given size.
-
-        Raises:
-            DataError: no pinhole, an impossible one, or one of images of another shape.
-        """
+        """A camera (``"02"``) of ``calib_cam_to_cam.txt``, for images resized to the given size."""
         size = self.matrix(f"S_rect_{camera}", (2,))
         if not (size > 0).all():
             raise DataError(f"{self.path} row S_rect_{camera} must hold a positive width and height; restore the file")
@@ -250,11 +231,7 @@ _MOST_BYTES = 2**28  # 16 million points of four numbers
 
 
 def read_packet(path: Path) -> FloatArray:
-    """One packet ``(30,)``.
-
-    Raises:
-        DataError: it cannot be read, or has not 30 numbers.
-    """
+    """One packet ``(30,)``."""
     try:
         row = [float(word) for word in read_text(path).split()]
     except (OSError, ValueError) as error:
@@ -265,11 +242,7 @@ def read_packet(path: Path) -> FloatArray:
 
 
 def velocity(oxts: Path, frame: int) -> FloatArray:
-    """Of the car in m/s: north, east, up ``(3,)``, from the packet of a frame in ``oxts/data``.
-
-    Raises:
-        DataError: the packet is missing or malformed.
-    """
+    """Of the car in m/s: north, east, up ``(3,)``, from the packet of a frame in ``oxts/data``."""
     path = oxts / f"{frame:010d}.txt"
     if not path.is_file():
         raise DataError(f"{path} is missing: the speed of the car comes from a packet of the GPS/IMU a frame")
@@ -280,9 +253,6 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
     """The points of a file of float32 ``(P, 3)``, metres, in the LiDAR frame; x, y, z are the first of ``columns``.
 
     Points at the LiDAR's own place or beyond 10 km, which it cannot measure, are left out.
-
-    Raises:
-        DataError: it cannot be read, is cut off, or has no other points.
     """
     try:
         content = read_bytes(path, _MOST_BYTES)

@@ -6,7 +6,7 @@ A missing number is a gap in time, not an error: the frame has no image.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -103,12 +103,11 @@ def by_name(paths: list[Path]) -> NumberedFiles:
         DataError: two files have the same number.
     """
     matches = [_NUMBERED.fullmatch(path.stem) for path in paths]
-    names = [(match["prefix"], int(match["number"])) for match in matches if match is not None]
-    numbers = [number for _, number in names]
-    if len(names) < len(paths) or len({prefix for prefix, _ in names}) != 1 or _typical_step(numbers) != 1:
+    numbers = [int(match["number"]) for match in matches if match is not None]
+    prefixes = {None if match is None else match["prefix"] for match in matches}
+    if None in prefixes or len(prefixes) > 1 or (len(numbers) > 1 and np.median(np.diff(numbers)) != 1):
         return in_order(paths)
-    frames = _numbered(paths, numbers)
-    return NumberedFiles(frames.paths, frames.rows)
+    return replace(_numbered(paths, numbers), first=0)
 
 
 def in_order(paths: list[Path]) -> NumberedFiles:
@@ -120,9 +119,6 @@ def by_table(listed: list[Path], table: Path) -> NumberedFiles:
     """The files that a table lists in the order of time; missing files are gaps.
 
     Rows before the first file and after the last are left out; ``first`` is the number of rows before the first file.
-
-    Raises:
-        DataError: none of them is there.
     """
     there = [row for row, path in enumerate(listed) if path.is_file()]
     if not there:
@@ -136,7 +132,3 @@ def _numbered(paths: list[Path], numbers: list[int]) -> NumberedFiles:
         if following <= number:
             raise DataError(f"{path} and {after.name} have the same number: keep one file a frame")
     return NumberedFiles(tuple(paths), tuple(number - numbers[0] for number in numbers), numbers[0])
-
-
-def _typical_step(numbers: list[int]) -> float:
-    return float(np.median(np.diff(numbers))) if len(numbers) > 1 else 1.0

@@ -78,9 +78,6 @@ def require_plausible(camera: Pinhole, where: str) -> None:
     Args:
         camera: as read.
         where: the file, and the row of it, for the message.
-
-    Raises:
-        DataError: see `impossible`.
     """
     problem = impossible(camera)
     if problem is not None:

@@ -39,11 +39,7 @@ class VideoFrames:
     """
 
     def __init__(self, path: Path, counted_frames: int = _COUNTED_FRAMES) -> None:
-        """Open a video; one that announces more than ``counted_frames`` is long.
-
-        Raises:
-            DataError: it cannot be decoded.
-        """
+        """Open a video; one that announces more than ``counted_frames`` is long."""
         self._path = path
         self._next = 0
         self._times_ms: list[float] = []
@@ -61,7 +57,9 @@ class VideoFrames:
                 self._frames,
             )
         self._shown_s = None if shown_s is None or (np.diff(shown_s) <= 0).any() else shown_s
-        self.fps = self._rate() or float(self._capture.get(cv2.CAP_PROP_FPS)) or None
+        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or None
+        if self._shown_s is not None and self._frames > 1:
+            self.fps = (self._frames - 1) / float(self._shown_s[-1] - self._shown_s[0])
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
         self.height, self.width = self._cached(0).shape[:2]
 
@@ -70,11 +68,7 @@ class VideoFrames:
         return self._frames
 
     def read(self, index: int) -> Image:
-        """One frame ``(height, width, 3)`` uint8 RGB.
-
-        Raises:
-            DataError: the video breaks off before it.
-        """
+        """One frame ``(height, width, 3)`` uint8 RGB."""
         return self._cached(index).copy()
 
     def times_s(self) -> NDArray[np.float64] | None:
@@ -87,12 +81,6 @@ class VideoFrames:
             )
         return self._shown_s
 
-    def _rate(self) -> float | None:
-        """Frames a second by their times."""
-        if self._shown_s is None or len(self._shown_s) < 2:
-            return None
-        return (len(self._shown_s) - 1) / float(self._shown_s[-1] - self._shown_s[0])
-
     def _decoded_times(self) -> NDArray[np.float64]:
         while self._grab():
             pass
@@ -102,7 +90,8 @@ class VideoFrames:
         ahead = index - self._next
         unseen = index >= len(self._times_ms)  # so that no seek could be checked
         if not (ahead >= 0 and (unseen or ahead <= _SKIPPED_FRAMES)) and not self._seek(index):
-            self._rewind()
+            self._capture.release()
+            self._capture, self._next = _capture(self._path), 0
         while self._next <= index:
             if not self._grab():
                 raise DataError(f"video {self._path} breaks off at frame {self._next}: use the frames 0:{self._next}")
@@ -129,10 +118,6 @@ class VideoFrames:
             return False
         self._next = index
         return True
-
-    def _rewind(self) -> None:
-        self._capture.release()
-        self._capture, self._next = _capture(self._path), 0
 
 
 def _packet_times(path: Path) -> NDArray[np.float64] | None:

@@ -15,7 +15,7 @@ from slam.commands.live.source import Source
 from slam.frames import Frame, Image
 from slam.runtime.errors import SequenceError
 from slam.sequences.recording import GrowingSequence
-from slam.sequences.undistortion import Undistortion, intrinsics_of
+from slam.sequences.undistortion import require_size, undistorted
 
 INTERRUPTED, OVER = "it was interrupted", "the source ended"
 EXPECTED = (INTERRUPTED, OVER)
@@ -125,15 +125,11 @@ class StreamedSequence(GrowingSequence):
             SequenceError: every frame is wanted of a source that does not wait.
             SequenceError: the camera has another image size than the source.
         """
-        if (camera.width, camera.height) != (source.width, source.height):
-            raise SequenceError(
-                f"{name} gives images of {source.width} x {source.height} and the camera file is for {camera.width} x "
-                f"{camera.height}: give the calibration of this camera at this size"
-            )
+        require_size(source, camera, name)
         if every_frame and not source.is_stored:
             raise SequenceError(f"{name} does not wait while an image is measured: leave out --every-frame")
-        undistortion = Undistortion(camera) if camera.is_distorted else None
-        super().__init__(intrinsics_of(camera), camera.height_or(None), name=name)
+        intrinsics, undistortion = undistorted(camera)
+        super().__init__(intrinsics, camera.height_or(None), name)
         prepare = undistortion.apply if undistortion is not None else lambda image: image
         self.reader = Reader(source, most_wait_s, prepare, every_frame)
         self.arrivals: dict[int, Arrival] = {}

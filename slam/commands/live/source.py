@@ -20,6 +20,7 @@ from erfsfm.common.readers.images import (
     is_image,
     natural_key,
     read_image,
+    read_values,
     stretch_of,
 )
 from slam.frames import Image
@@ -121,7 +122,7 @@ class FolderSource:
         """Height and width of the first image that can be read; None while there is none."""
         try:
             if waiting := self._waiting():
-                self._stretch = stretch_of(waiting)
+                self._stretch = stretch_of(waiting, read_values)
                 return first_size(waiting)
         except DataError:
             pass  # it is still being written

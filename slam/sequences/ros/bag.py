@@ -34,11 +34,7 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a bag.
-
-        Raises:
-            SequenceError: it is damaged, or rosbags is not installed.
-        """
+        """Open a bag."""
         self.path = path
         self._is_ros1 = path.suffix == ".bag"
         rosbag1, rosbag2, typesys = import_extra("ros")
@@ -58,52 +54,32 @@ class Bag:
         return sorted(topic for topic, kind in self.types.items() if kind in types and counts[topic] != 0)
 
     def raw(self, topic: str, start_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
-        """The messages of a topic as stored, with the times at which they were recorded, from ``start_ns`` on.
-
-        Raises:
-            SequenceError: the bag is damaged.
-        """
+        """The messages of a topic as stored, with the times at which they were recorded, from ``start_ns`` on."""
         connections = [each for each in self._reader.connections if each.topic == topic]
         with self._errors():
             for _, time_ns, data in self._reader.messages(connections=connections, start=start_ns):
                 yield time_ns, data
 
     def messages(self, topic: str) -> Iterator[Any]:
-        """The messages of a topic, in the order in which they were recorded.
-
-        Raises:
-            SequenceError: the bag is damaged.
-        """
+        """The messages of a topic, in the order in which they were recorded."""
         for _, data in self.raw(topic):
             yield self.parse(topic, data)
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic.
-
-        Raises:
-            SequenceError: it has none, or the bag is damaged.
-        """
+        """The first message of a topic."""
         message = next(self.messages(topic), None)
         if message is None:
             raise SequenceError(f"topic {topic} of {self.path} has no messages")
         return message
 
     def parse(self, topic: str, data: bytes) -> Any:
-        """A message as stored, by the type of its topic.
-
-        Raises:
-            SequenceError: it is damaged.
-        """
+        """A message as stored, by the type of its topic."""
         with self._errors():
             parse = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
             return parse(data, self.types[topic])
 
     def stamp_ns(self, data: bytes) -> int:
-        """The stamp in nanoseconds of a message as stored whose first field is a header, without reading all of it.
-
-        Raises:
-            SequenceError: it is damaged.
-        """
+        """The stamp in nanoseconds of a message as stored whose first field is a header, without reading all of it."""
         with self._errors():
             if self._is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<II", data, 4)  # after the sequence number

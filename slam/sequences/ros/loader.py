@@ -5,17 +5,15 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile
-from erfsfm.common.readers.images import Stretch, first_usual
+from erfsfm.common.readers.images import first_usual, stretch_of
 from slam.formats.rows import BadRows
 from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
@@ -24,7 +22,7 @@ from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near, poses_of
-from slam.sequences.recording import RecordedSequence, ScanReader, Source
+from slam.sequences.recording import ArrayReader, RecordedSequence, Source
 from slam.sequences.ros import messages as ros
 from slam.sequences.ros.bag import Bag, is_bag
 from slam.sequences.ros.messages import is_rectified
@@ -43,7 +41,6 @@ _STATIC_TOPIC, _MOVING_TOPIC = "/tf_static", "/tf"
 _MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
 _SKIPPED_FRAMES = 30
-_STRETCHED_BY = 16  # images
 _SCAN_DELAY_S = 0.05
 _NANOSECONDS = 10**9
 
@@ -56,11 +53,7 @@ class StampedMessages:
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """Read the stamps.
-
-        Raises:
-            SequenceError: the topic has no messages, or the bag is damaged.
-        """
+        """Read the stamps."""
         self._bag, self.topic = bag, topic
         pairs = [(time_ns, bag.stamp_ns(data)) for time_ns, data in bag.raw(topic)]
         if not pairs:
@@ -89,11 +82,7 @@ class StampedMessages:
         return len(self._numbers)
 
     def read(self, index: int) -> Any:
-        """One message.
-
-        Raises:
-            SequenceError: the bag is damaged.
-        """
+        """One message."""
         number = self._numbers[index]
         if not self._next <= number <= self._next + _SKIPPED_FRAMES or self._next == 0:
             time_ns = self._times_ns[number]
@@ -116,14 +105,12 @@ class BagImages:
     """The images of a topic, all of the size of the first readable ones. Not for use from several threads."""
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """Read the stamps of all and the first readable images for their size.
-
-        Raises:
-            SequenceError, DataError: the bag is damaged, or none of its first 100 images can be read.
-        """
+        """Read the stamps of all and the first readable images for their size."""
         self.messages = StampedMessages(bag, topic)
         self._where = f"an image of {topic} in {bag.path}"
-        self._stretch = self._common_stretch()
+        self._stretch = stretch_of(
+            range(len(self)), lambda index: ros.values_of(self.messages.read(index), self._where)
+        )
         self.height, self.width = first_usual(range(len(self))[:_SOUGHT_IMAGES], self._decode)[1].shape[:2]
 
     def __len__(self) -> int:
@@ -131,11 +118,7 @@ class BagImages:
         return len(self.messages)
 
     def read(self, index: int) -> Image:
-        """One image ``(height, width, 3)`` uint8 RGB.
-
-        Raises:
-            SequenceError, DataError: it cannot be read, or has another size than the first ones.
-        """
+        """One image ``(height, width, 3)`` uint8 RGB."""
         image = self._decode(index)
         if image.shape[:2] != (self.height, self.width):
             height, width = image.shape[:2]
@@ -145,40 +128,28 @@ class BagImages:
     def _decode(self, index: int) -> Image:
         return ros.image_of(self.messages.read(index), self._where, self._stretch)
 
-    def _common_stretch(self) -> Stretch | None:
-        """By some images; None where they have eight bits."""
-        seen: list[NDArray[np.uint16]] = []
-        for index in range(0, len(self), max(len(self) // _STRETCHED_BY, 1)):
-            with suppress(SequenceError, DataError):
-                seen.append(ros.values_of(self.messages.read(index), self._where))
-                if seen[-1].dtype != np.uint16:
-                    return None
-        return Stretch.of(seen) if seen else None
+
+Mounts = dict[str, tuple[str, FloatArray]]
+"""Parent and ``T_parent_child`` ``(4, 4)`` of each frame of ``/tf_static``; the last that is said counts."""
 
 
-class StaticTransforms:
-    """The tree of the frames of ``/tf_static``."""
+def transform_between(mounts: Mounts, a: str, b: str) -> FloatArray | None:
+    """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
+    if not (frame_name(a) and frame_name(b)):
+        return None
+    (root_a, T_root_a), (root_b, T_root_b) = (_from_root(mounts, frame_name(frame)) for frame in (a, b))
+    return invert(T_root_a) @ T_root_b if root_a == root_b else None
 
-    def __init__(self, bag: Bag) -> None:
-        """Read all static transforms; the last of a frame counts."""
-        self._parents = {child: (parent, T) for parent, child, _, T in transforms(bag, _STATIC_TOPIC)}
 
-    def between(self, a: str, b: str) -> FloatArray | None:
-        """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
-        if not (frame_name(a) and frame_name(b)):
-            return None
-        (root_a, T_root_a), (root_b, T_root_b) = (self._from_root(frame_name(frame)) for frame in (a, b))
-        return invert(T_root_a) @ T_root_b if root_a == root_b else None
-
-    def _from_root(self, frame: str) -> tuple[str, FloatArray]:
-        T_root_frame, seen = np.eye(4), {frame}
-        while frame in self._parents:
-            frame, T_parent_child = self._parents[frame]
-            if frame in seen:
-                break  # a loop has no root
-            seen.add(frame)
-            T_root_frame = T_parent_child @ T_root_frame
-        return frame, T_root_frame
+def _from_root(mounts: Mounts, frame: str) -> tuple[str, FloatArray]:
+    T_root_frame, seen = np.eye(4), {frame}
+    while frame in mounts:
+        frame, T_parent_child = mounts[frame]
+        if frame in seen:
+            break  # a loop has no root
+        seen.add(frame)
+        T_root_frame = T_parent_child @ T_root_frame
+    return frame, T_root_frame
 
 
 def moving_frames(bag: Bag) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
@@ -224,37 +195,30 @@ def transform_of(message: Any) -> FloatArray:
 
 
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
-    """Open the images of a topic with what the bag has beside: calibration, true poses, LiDAR scans.
-
-    Raises:
-        SequenceError, DataError: the bag is damaged, or its images have no calibration.
-    """
+    """Open the images of a topic with what the bag has beside: calibration, true poses, LiDAR scans."""
     bag = Bag(path)
     stored = BagImages(bag, topic)
     stamps = stored.messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     calibration = partial(_calibration, bag, topic, fps, (stored.width, stored.height))
     camera = find_camera_file(asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration)
-    mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
-    T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)
+    mounts: Mounts = {child: (parent, T) for parent, child, _, T in transforms(bag, _STATIC_TOPIC)}
+    frame = bag.first(topic).header.frame_id
+    T_camera_lidar, scans = _scans(bag, mounts, frame, stamps)
     return RecordedSequence(
         name=name,
         images=stored,
         camera=camera,
         stamps=stamps,
         sources=(Source(f"bag/{name}"),),
-        T_any_camera=_true_poses(bag, mounted, frame, stamps),
+        T_any_camera=_true_poses(bag, mounts, frame, stamps),
         T_camera_lidar=T_camera_lidar,
         scans=scans,
     )
 
 
 def camera_topics(path: Path) -> list[str]:
-    """Topics of a bag with pictures of a camera, without depth; rectified ones in place of the same camera's raw ones.
-
-    Raises:
-        SequenceError: the bag is damaged.
-    """
+    """Topics of a bag with pictures of a camera, not depth; rectified ones in place of the same camera's raw ones."""
     with closing(Bag(path)) as bag:
         topics = [
             topic
@@ -283,13 +247,13 @@ def _home(topic: str) -> str:
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
-def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray) -> FloatArray | None:
+def _true_poses(bag: Bag, mounts: Mounts, camera: str, stamps: FloatArray) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps from a topic or frame that is named as truth, NaN where unknown."""
     unused = dict.fromkeys(bag.topics(*_POSITIONS), "has positions without rotations")
     for topic in bag.topics(*_POSES):
         first = bag.first(topic)
         body = getattr(first, "child_frame_id", None)
-        T_body_camera = np.eye(4) if body is None else mounted.between(body, camera)
+        T_body_camera = np.eye(4) if body is None else transform_between(mounts, body, camera)
         if not any(map(_TRUTH.search, (topic, first.header.frame_id, body or ""))):
             unused[topic] = "is not named as truth"
         elif T_body_camera is None:
@@ -300,7 +264,7 @@ def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatA
             known, T_any_body = _poses(StampedMessages(bag, topic))
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
     for (parent, body), (known, T_any_body) in moving_frames(bag).items():
-        T_body_camera = mounted.between(body, camera)
+        T_body_camera = transform_between(mounts, body, camera)
         if T_body_camera is not None and any(map(_TRUTH.search, (parent, body))):
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
         unused[f"{parent} to {body} in {_MOVING_TOPIC}"] = "is not named as truth, or not joined to the camera"
@@ -326,14 +290,14 @@ def _poses(messages: StampedMessages) -> tuple[FloatArray, FloatArray]:
 
 
 def _scans(
-    bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray
-) -> tuple[FloatArray | None, dict[int, ScanReader]]:
+    bag: Bag, mounts: Mounts, camera: str, stamps: FloatArray
+) -> tuple[FloatArray | None, dict[int, ArrayReader]]:
     """``T_camera_lidar`` and clouds of the first LiDAR whose mount is known.
 
     A frame has the cloud nearest to it, if within 50 ms and not nearer to another frame.
     """
     for topic in bag.topics(ros.POINT_CLOUD):
-        T_camera_lidar = mounted.between(camera, bag.first(topic).header.frame_id)
+        T_camera_lidar = transform_between(mounts, camera, bag.first(topic).header.frame_id)
         if T_camera_lidar is None:
             logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
             continue

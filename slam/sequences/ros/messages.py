@@ -49,11 +49,7 @@ def shows_pictures(message: Any, topic: str) -> bool:
 
 
 def values_of(message: Any, where: str) -> NDArray[Any]:
-    """The values ``(H, W, C)`` of an ``Image`` as stored, or those of a ``CompressedImage``.
-
-    Raises:
-        SequenceError: an encoding that is not known, or too few bytes.
-    """
+    """The values ``(H, W, C)`` of an ``Image`` as stored, or those of a ``CompressedImage``."""
     if hasattr(message, "format"):
         return decode_values(bytes(message.data), where)
     encoding = message.encoding
@@ -76,9 +72,6 @@ def image_of(message: Any, where: str, stretch: Stretch | None = None) -> Image:
     """The picture ``(H, W, 3)`` uint8 RGB of an ``Image`` or a ``CompressedImage``.
 
     Values of 16 bits are stretched; without a ``stretch`` by their own range.
-
-    Raises:
-        SequenceError, DataError: an encoding that is not known, or too few bytes.
     """
     if hasattr(message, "format"):
         return decode_image(bytes(message.data), where, stretch)
@@ -95,9 +88,6 @@ def camera_file_of(
 
     The calibration is of the whole sensor; images are its region of interest, binned (REP 104). Some drivers state a
     binning of images that are whole: those of ``size`` (width, height) as large as the calibration are.
-
-    Raises:
-        SequenceError, DataError: it was not calibrated, or the model of the lens is unknown.
     """
     K, P, distortion = (getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd")
     try:
@@ -128,11 +118,7 @@ def is_rectified(topic: str) -> bool:
 
 
 def points_of(cloud: Any, where: str) -> FloatArray:
-    """The finite points ``(P, 3)`` of a ``PointCloud2`` in its frame, metres.
-
-    Raises:
-        DataError: it has no x, y, z as float32, or too few bytes.
-    """
+    """The finite points ``(P, 3)`` of a ``PointCloud2`` in its frame, metres."""
     offsets = {field.name: field.offset for field in cloud.fields if field.datatype == _FLOAT32}
     if not {"x", "y", "z"} <= offsets.keys():
         raise DataError(f"{where} has no x, y and z as float32")

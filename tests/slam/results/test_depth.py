@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from slam.frames import Intrinsics
 from slam.mapping.filters import KeyframeDepth
 from slam.results.depth import DepthQuality, projected, true_depth
-from slam.sequences.images import DepthMaps
+from slam.sequences.images import read_depth_map
 from slam.sequences.recording import RecordedSequence, Source
 
 CAMERA = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5)
@@ -31,7 +33,7 @@ def with_depth(tmp_path) -> RecordedSequence:
 
     path = tmp_path / "000002.png"
     cv2.imwrite(str(path), (DEPTH * 256).astype(np.uint16))
-    return recorded(depth_maps=DepthMaps({2: path}))
+    return recorded(depth_maps={2: partial(read_depth_map, path)})
 
 
 def test_stored_depth_is_read_and_compared(tmp_path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from slam.geometry.se3 import FloatArray, apply
 from slam.results.map_error import find_truth, map_errors
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.images import read_depth_map
 from slam.sequences.recording import RecordedSequence
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
@@ -79,7 +81,7 @@ def test_true_depth_at_true_poses_has_no_error(
 def test_scans_are_a_truth(on_disk: Path, true_map: FloatArray) -> None:
     sequence = open_sequence(on_disk)
     assert isinstance(sequence, RecordedSequence)
-    sequence.depth_maps = None
+    sequence.depth_maps = {}
     found = errors(true_map, sequence)
     assert found["truth"] == "lidar"
     assert found["in_field"]["accuracy_median_m"] < 0.08
@@ -94,7 +96,7 @@ def test_scans_that_cannot_be_read_measure_nothing(on_disk: Path, true_map: Floa
 
     sequence = open_sequence(on_disk)
     assert isinstance(sequence, RecordedSequence)
-    sequence.depth_maps, sequence.scans[5] = None, cut_off
+    sequence.depth_maps, sequence.scans[5] = {}, cut_off
     assert errors(true_map, sequence)["completeness"] > 0.9
     sequence.scans = dict.fromkeys(sequence.scans, cut_off)
     found = errors(true_map, sequence)
@@ -124,7 +126,7 @@ def test_one_scale_is_fitted_apart(on_disk: Path, true_map: FloatArray) -> None:
 def test_without_truth_every_number_has_a_reason(on_disk: Path) -> None:
     sequence = open_sequence(on_disk)
     assert isinstance(sequence, RecordedSequence)
-    sequence.depth_maps, sequence.scans = None, {}
+    sequence.depth_maps, sequence.scans = {}, {}
     found = errors(np.zeros((5, 3)), sequence)
     missing = [key for key in found if not key.endswith("_reason")]
     assert all(found[key] is None and "neither depth maps nor LiDAR" in found[f"{key}_reason"] for key in missing)
@@ -134,7 +136,7 @@ def test_without_truth_every_number_has_a_reason(on_disk: Path) -> None:
 
 def test_a_damaged_depth_map_costs_the_error_of_the_map_and_no_more(on_disk: Path, true_map: FloatArray) -> None:
     sequence = open_sequence(on_disk)
-    assert isinstance(sequence, RecordedSequence) and sequence.depth_maps is not None
-    sequence.depth_maps.paths[3] = on_disk / "camera.yaml"
+    assert isinstance(sequence, RecordedSequence)
+    sequence.depth_maps[3] = partial(read_depth_map, on_disk / "camera.yaml")
     found = errors(true_map, sequence)
     assert found["accuracy_median_m"] is None and "camera.yaml" in found["accuracy_median_m_reason"]

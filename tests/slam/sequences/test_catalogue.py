@@ -8,11 +8,6 @@ from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds, sequence_names
 
 
-def test_only_sequence_needs_no_name(tmp_path: Path, odometry) -> None:
-    odometry(tmp_path, name="07")
-    assert open_sequence(tmp_path, None, None, None).name == "07"
-
-
 def test_several_sequences_are_listed(tmp_path: Path, odometry) -> None:
     for name in ("02", "10", "00"):
         odometry(tmp_path, name=name, frames=2)

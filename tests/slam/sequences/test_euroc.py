@@ -103,7 +103,6 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
     [
         ("sensor.yaml", "radial-tangential", "omni", "omni is unknown: known are .*give --camera"),
         ("sensor.yaml", "resolution:", "size:", "lacks .resolution"),
-        ("sensor.yaml", "[30, 30, 20, 12]", "[30, 30, 200, 12]", r"sensor\.yaml: cx, cy: \(200, 12\) lies outside"),
         ("sensor.yaml", "T_BS", "T_SB", "needs T_BS with data of 4 x 4 numbers"),
         ("sensor.yaml", "rate_hz: 20", "rate_hz: !!python/object/apply:os.getcwd []", "could not determine"),
     ],
@@ -116,13 +115,6 @@ def test_damage(flight: Path, name: str, old: str, new: str, message: str) -> No
     with pytest.raises(SequenceError, match=message) as caught:
         open_sequence(flight)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("stamp", ["soon", FIRST_NS + STEP_NS], ids=["no stamp", "repeated"])
-def test_a_bad_row_of_the_index_is_left_out(flight: Path, stamp: object) -> None:
-    path = flight / "cam0/data.csv"
-    path.write_text(path.read_text().replace(f"{FIRST_NS},", f"{stamp},", 1))
-    assert len(open_sequence(flight)) == FRAMES - 1
 
 
 @pytest.mark.data

@@ -8,9 +8,10 @@ from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence
 
 
-@pytest.mark.parametrize("inner", ["", "images", "data"])
-@pytest.mark.parametrize("beside", [False, True])
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".jpeg", ".bmp"])
+@pytest.mark.parametrize(
+    ("inner", "beside", "suffix"),
+    [("", False, ".png"), ("images", True, ".jpg"), ("data", False, ".jpeg"), ("", True, ".bmp")],
+)
 def test_layouts(tmp_path: Path, images, camera_yaml: str, inner: str, beside: bool, suffix: str) -> None:
     folder = tmp_path / "drive"
     images(folder / inner, [f"f{k}{suffix}" for k in range(12)])

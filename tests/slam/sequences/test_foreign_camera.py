@@ -85,14 +85,3 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, name: str, text: str, words: 
     with pytest.raises((SequenceError, DataError), match=words) as caught:
         read_explicit(tmp_path / name)
     assert "\n" not in str(caught.value)
-
-
-def test_sensor_of_euroc(tmp_path: Path) -> None:
-    path = tmp_path / "sensor.yaml"
-    path.write_text(
-        "T_BS: {cols: 4, rows: 4, data: []}\nrate_hz: 20\nresolution: [40, 24]\ncamera_model: pinhole\n"
-        "intrinsics: [30, 31, 20, 12]\ndistortion_model: radial-tangential\n"
-        "distortion_coefficients: [-0.1, 0.02, 0.001, -0.002]\n"
-    )
-    camera = read_explicit(path)
-    assert (camera.fx, camera.fps, camera.model, camera.distortion[0]) == (30, 20, "opencv", -0.1)

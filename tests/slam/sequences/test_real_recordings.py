@@ -65,19 +65,3 @@ def test_lidar_lands_on_the_image(data_root: Path) -> None:
     points = se3.apply(sequence.T_camera_lidar, sequence.scan(0))
     road = points[(np.abs(points[:, 0]) < 2) & (points[:, 2] > 6) & (points[:, 2] < 12)]
     assert np.median(road[:, 1]) == pytest.approx(1.65, abs=0.15)
-
-
-def test_video_in_any_order(data_root: Path) -> None:
-    path = data_root / "folders/kitti_video_b/drive.mp4"
-    in_order = open_sequence(path, None, None, None)
-    images = {index: in_order.frame(index).image for index in range(60)}
-    jumping = open_sequence(path, None, None, None)
-    for index in (50, 3, 59, 0, 41, 2):
-        assert np.array_equal(jumping.frame(index).image, images[index])
-
-
-def test_a_range_of_a_real_sequence(data_root: Path) -> None:
-    sequence = open_sequence(data_root / "kitti_odometry", "05", None, "100:150")
-    assert len(sequence) == 50 and sequence.provenance() == ("kitti_odometry/05[100:150]",)
-    assert sequence.reference is not None
-    assert sequence.reference[1, 2, 3] > 0.5

@@ -31,11 +31,6 @@ def test_reads(tmp_path: Path, camera_yaml: str, line: str, height: float | None
     assert not camera.is_distorted
 
 
-def test_exponent_without_dot_is_a_number(tmp_path: Path, camera_yaml: str) -> None:
-    text = camera_yaml + "model: opencv\ndistortion: [1e-4, 0, 0, 0]\n"
-    assert read_camera_file(written(tmp_path, text)).distortion[0] == 1e-4
-
-
 @pytest.mark.parametrize(
     "text, message",
     [

@@ -13,9 +13,8 @@ from meshes import coloured_ply
 
 from slam.commands.cli import app
 from slam.commands.export import export
-from slam.commands.occupancy import Grid, ground_along, occupancy_grid, samples
+from slam.commands.occupancy import FREE, OCCUPIED, UNKNOWN, Grid, ground_along, occupancy_grid, samples, write_ros_map
 from slam.formats.ply import Ply
-from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN, write_ros_map
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -66,20 +66,10 @@ def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
     assert np.array_equal(open_sequence(bag.close()).frame(0).image, expected)
 
 
-@pytest.mark.parametrize(
-    "encoding, channels",
-    [
-        ("rgb8", 3),
-        ("bgr8", 3),
-        ("rgba8", 4),
-        ("bgra8", 4),
-        ("8UC3", 3),
-        ("yuv422", 2),
-        ("yuv422_yuy2", 2),
-        ("mono16", 1),
-        ("16UC1", 1),
-    ],
-)
+CHANNELS = {"rgb8": 3, "bgra8": 4, "8UC3": 3, "yuv422": 2, "yuv422_yuy2": 2, "mono16": 1, "16UC1": 1}
+
+
+@pytest.mark.parametrize(("encoding", "channels"), CHANNELS.items())
 def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: int) -> None:
     """Channels of equal value are grey in every encoding; of YUV 4:2:2 those with chroma 128."""
     level = 90
@@ -300,16 +290,3 @@ def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(imports.importlib, "import_module", absent)
     with pytest.raises(SequenceError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
         open_sequence(tmp_path / "walk.bag")
-
-
-def compressed(new_bag: NewBag, kind: str, count: int, damaged: Collection[int]) -> Path:
-    """A bag of PNG pictures, of which some are cut off."""
-    bag = new_bag(kind)
-    bag.camera_info("/c/camera_info", CAMERA, "", ())
-    for k in range(count):
-        data = cv2.imencode(".png", picture(k, 3))[1].ravel()
-        cut = data[: len(data) // 2] if k in damaged else data
-        header = bag.header(FIRST_NS + k * STEP_NS, "c")
-        message = bag.make("sensor_msgs/msg/CompressedImage", header=header, format="png", data=cut)
-        bag.write("/c/image/compressed", FIRST_NS + k * STEP_NS, message)
-    return bag.close()

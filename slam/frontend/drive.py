@@ -23,7 +23,6 @@ from slam.frames import (
     resized_depth,
     runs,
 )
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
@@ -31,6 +30,7 @@ from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.segments import Segment
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
@@ -101,7 +101,7 @@ class Drive:
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: list[RelativeRotation] = field(default_factory=list)
     failures: list[tuple[int, int, str]] = field(default_factory=list)
-    roads: list[GroundPlane | MeasurementFailure] = field(default_factory=list)
+    roads: list[GroundPlane | Failed] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
     unusable: dict[int, str] = field(default_factory=dict)

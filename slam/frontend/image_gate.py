@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Frame, Grey, Mask
-from slam.frontend.failure import MeasurementFailure
+from slam.runtime.errors import Failed
 
 _THUMBNAIL = (32, 16)  # width, height
 _SHRINKING = 4  # averages out compression noise
@@ -34,7 +34,7 @@ _BRIGHT_GREY = 235.0  # the sky does not change where the camera sees white
 _STANDING_IMAGES, _REMEMBERED_IMAGES = 20, 50
 _REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
 
-Verdict = Literal["new", "repeated"] | MeasurementFailure
+Verdict = Literal["new", "repeated"] | Failed
 _Layer = NDArray[np.float32]
 
 
@@ -64,7 +64,7 @@ class ImageGate:
         """Whether an image shows something new, repeats the one before (also after compression), or is unusable."""
         if self._last is None or not np.array_equal(frame.image, self._last.image):
             self._verdict = self._classify(frame)
-        elif not isinstance(self._verdict, MeasurementFailure):
+        elif not isinstance(self._verdict, Failed):
             self._verdict = "repeated"
         self._last = frame
         return self._verdict
@@ -74,11 +74,11 @@ class ImageGate:
         if contrast < _BLANK_CONTRAST:
             # images after a dark one are not compared with those before it
             self._shrunk, self._difference = None, 0.0
-            return MeasurementFailure("the image is blank")
+            return Failed("the image is blank")
         shrunk = _shrunk(frame.grey)
         thumbnail = cv2.resize(shrunk, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         if float(thumbnail.std()) < _NOISE_CONTRAST * contrast:
-            return MeasurementFailure("the image is noise")
+            return Failed("the image is noise")
         return self._compared(shrunk)
 
     def _compared(self, shrunk: _Layer) -> Verdict:

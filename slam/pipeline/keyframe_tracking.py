@@ -13,7 +13,6 @@ from erfsfm.common.threads import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.local_map import LocalMap, MapSegment
 from slam.frontend.keyframes.odometry import MAX_CORNERS, KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
@@ -24,6 +23,7 @@ from slam.geometry.se3 import FloatArray, invert
 from slam.loops.descriptors import describe
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
+from slam.runtime.errors import Failed
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
@@ -190,6 +190,6 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
     return is_fast and scatter_deg < _VEHICLE_SCATTER_DEG
 
 
-def height_of(road: GroundPlane | MeasurementFailure) -> float | None:
+def height_of(road: GroundPlane | Failed) -> float | None:
     """The camera's height over the ground plane of a frame, unscaled; None without one."""
     return road.height_unscaled if isinstance(road, GroundPlane) else None

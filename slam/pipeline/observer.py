@@ -17,7 +17,6 @@ from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
 from slam.frontend.drive import Drive, Keyframe
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
@@ -30,7 +29,7 @@ from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import FloatArray, chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking, height_of
-from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
+from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch, return_freed_memory
 
@@ -165,7 +164,7 @@ class Observer:
         self._unread = 0
         with self._stopwatch.stage("read"):
             verdict: Verdict = self._gate.check(frame) if self._config.gaps.enabled else "new"
-        if isinstance(verdict, MeasurementFailure):
+        if isinstance(verdict, Failed):
             self._leave_out(index, verdict.reason)
             return
         asked = self._ask_networks(frame)
@@ -210,7 +209,7 @@ class Observer:
             self._measure_pending()
         finally:  # the error is of the frame before
             self.drive.unusable[index] = reason
-            self.drive.roads.append(MeasurementFailure(reason))
+            self.drive.roads.append(Failed(reason))
             self._snippet_frames = ()
 
     def _ask_networks(self, frame: Frame) -> FrameInWork:
@@ -271,7 +270,7 @@ class Observer:
             reason = f"it could not be measured: {explained(error)}"
             self.drive.unusable[index] = reason
             if len(self.drive) == index:  # one entry in ``roads`` as all frames
-                self.drive.roads.append(MeasurementFailure(reason))
+                self.drive.roads.append(Failed(reason))
             self._failed += 1
             is_known = isinstance(error, OneLineError | OSError | MemoryError)
             if is_known or shows_traceback() or not self._is_gap(self._failed):
@@ -292,7 +291,7 @@ class Observer:
             rotation = self._relative_rotation(current.frame)
         self._finish_tasks()
         self._keyframes.choose(drive)
-        drive.roads.append(MeasurementFailure("its depth was not predicted"))
+        drive.roads.append(Failed("its depth was not predicted"))
         self._recent = (*self._recent, current)[-ROTATION_BASELINE:]
         if current.snippet is not None:
             self._tasks.append(Task("pose network", current.snippet, self._keep_snippet))
@@ -355,8 +354,8 @@ class Observer:
         depth = self._depth_of(previous)
         measured = self._odometry.measure(previous.frame, current.frame, depth, previous.height, current.standing)
         if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
-            measured = MeasurementFailure(_NO_POSE)
-        if isinstance(measured, MeasurementFailure):
+            measured = Failed(_NO_POSE)
+        if isinstance(measured, Failed):
             self.drive.failures.append((previous.frame.index, current.frame.index, measured.reason))
             logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.frame.index, measured.reason)
             return None
@@ -375,7 +374,7 @@ class Observer:
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
         return self._odometry.relative_rotation(first.frame, current, self._depth_of(first), T_first_current)
 
-    def _keep_road(self, ends: Ends, step: RoadStep | MeasurementFailure) -> None:
+    def _keep_road(self, ends: Ends, step: RoadStep | Failed) -> None:
         if isinstance(step, RoadStep):
             self.drive.road_steps[ends] = step
         else:

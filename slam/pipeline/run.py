@@ -19,7 +19,6 @@ from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
@@ -45,8 +44,7 @@ from slam.pipeline.fusion import fuse
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observations, Observer
 from slam.pipeline.positioning import Location, Positioning
-from slam.runtime.attempt import Failed, attempt
-from slam.runtime.errors import SequenceError, SlamError
+from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
@@ -258,7 +256,7 @@ class SlamPipeline:
             factors = with_lidar(factors, lidar_steps)
         return Odometry(drive, scale, factors, chain_odometry(factors, len(drive)), lidar_steps, agreements)
 
-    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
+    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | Failed:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
         sequence = self.sequence
         if self.mode == "reference" and sequence.reference is not None:
@@ -280,8 +278,8 @@ class SlamPipeline:
         return odometry, closure.closures(odometry.scale)
 
     def _optimised(
-        self, odometry: Odometry, loops: LoopClosures, location: Location | MeasurementFailure | None
-    ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | MeasurementFailure | None]:
+        self, odometry: Odometry, loops: LoopClosures, location: Location | Failed | None
+    ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | Failed | None]:
         """The graph, its trajectory ``(N, 4, 4)``, the loops that agree with it, and where it lies on the earth."""
         graph, positioning = PoseGraph(), self._positioning
         T_odometry = odometry.T_world_camera
@@ -302,7 +300,7 @@ class SlamPipeline:
         return mapped
 
     def _compared(
-        self, drive: Drive, lidar: LidarPath | MeasurementFailure | None, observed: Observations
+        self, drive: Drive, lidar: LidarPath | Failed | None, observed: Observations
     ) -> tuple[Sequence[RelativePose], list[Agreement]]:
         """Steps by LiDAR unless the images contradict them, and LiDAR and depth from elsewhere beside the images.
 
@@ -322,7 +320,7 @@ class SlamPipeline:
 
     def _confidence(
         self, odometry: Odometry, observed: Observations
-    ) -> tuple[list[Agreement], FloatArray | None, float | MeasurementFailure]:
+    ) -> tuple[list[Agreement], FloatArray | None, float | Failed]:
         """Agreements of all sources and of the images, the support of each frame, and what follows from both."""
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
         if self._positioning is not None and self._positioning.agreement is not None:

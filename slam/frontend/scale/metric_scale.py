@@ -15,13 +15,13 @@ import numpy as np
 from slam.config.sections import ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_from_road, scale_track
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
 from slam.frontend.visual.motion import Motion, links, triangulated
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
@@ -48,7 +48,7 @@ class Scale:
     """
 
     mode: ScaleMode
-    estimate: ScaleEstimate | MeasurementFailure
+    estimate: ScaleEstimate | Failed
     per_frame: FloatArray
     lengths: Mapping[Ends, StepLength]
     unit: LengthUnit
@@ -64,9 +64,9 @@ class Scale:
         """``m``, with mode none ``unit``; None where metres were not found."""
         return "m" if self.is_metric else self.unit if self.mode == "none" else None
 
-    def in_metres(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
+    def in_metres(self, other: ScaleEstimate | Failed) -> Scale:
         """In metres, by those per unit of this scale; where they were not found the unit stays."""
-        if isinstance(other, MeasurementFailure):
+        if isinstance(other, Failed):
             logger.warning("no scale (%s): lengths stay in %s", other.reason, self.unit)
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
@@ -100,7 +100,7 @@ def find_scale(
         sigmas = {pose.ends: float(pose.sigmas[3]) for pose in lidar_steps}
         absolute |= {ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0}
     by_planes = scale_from_road(drive.roads, height)
-    if isinstance(by_planes, MeasurementFailure):
+    if isinstance(by_planes, Failed):
         prior_unit = np.full(frames, _unit_by_steps(motions, absolute))
     elif absolute:
         # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
@@ -109,7 +109,7 @@ def find_scale(
         prior_unit = scale_track(drive.roads, height, by_planes)
     steps = links(motions, frames)
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
-    if not isinstance(by_planes, MeasurementFailure):
+    if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         evidence = evidence.without_contradicted(_MAX_CONTRADICTION)
     solved = solve_lengths(evidence)
@@ -123,7 +123,7 @@ def find_scale(
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
-    elif isinstance(by_planes, MeasurementFailure):
+    elif isinstance(by_planes, Failed):
         named = "the networks' own unit"
         logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
     if named == "camera heights" and _frames_with_road(by_planes, used) < _LEAST_ROAD * frames:
@@ -132,9 +132,9 @@ def find_scale(
     return Scale(mode, estimate, per_frame, _measured_lengths(steps, solved), named, contradicted)
 
 
-def _frames_with_road(by_planes: ScaleEstimate | MeasurementFailure, steps: int) -> int:
+def _frames_with_road(by_planes: ScaleEstimate | Failed, steps: int) -> int:
     """Frames that see a road by learned depth, or by the homography of so many steps."""
-    return max(steps, 0 if isinstance(by_planes, MeasurementFailure) else by_planes.frames_used)
+    return max(steps, 0 if isinstance(by_planes, Failed) else by_planes.frames_used)
 
 
 def _measured_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, StepLength]:

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Frame, Intrinsics, Mask, resized_mask
-from slam.frontend.failure import MeasurementFailure
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
 _LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # searched; refinement converges between them
@@ -84,7 +84,7 @@ class RoadHomography:
 
     def measure(
         self, previous: Frame, current: Frame, T_previous_current: FloatArray, standing: Mask | None = None
-    ) -> RoadStep | MeasurementFailure:
+    ) -> RoadStep | Failed:
         """Measure the length of a step whose rotation and direction are known.
 
         Args:
@@ -114,20 +114,20 @@ class RoadHomography:
 
     def _measured_on(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
-    ) -> RoadStep | MeasurementFailure:
+    ) -> RoadStep | Failed:
         if len(strip.rows) < _MIN_POINTS:
-            return MeasurementFailure("the image shows too little of the road")
+            return Failed("the image shows too little of the road")
         step, correlation, standing = self._aligned(strip, previous, current, T_unit, expected)
         plane = step.plane
         length = float(np.linalg.norm(plane))
         normal = plane / length
         deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
         if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
-            return MeasurementFailure(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
+            return Failed(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
         if correlation < _MIN_CORRELATION:
-            return MeasurementFailure(f"both images of the road do not correlate ({correlation:.2f})")
+            return Failed(f"both images of the road do not correlate ({correlation:.2f})")
         if 1.0 - correlation > (1.0 - _MIN_GAIN) * (1.0 - standing):
-            return MeasurementFailure(f"the image in front of the car stands still (correlation {standing:.2f})")
+            return Failed(f"the image in front of the car stands still (correlation {standing:.2f})")
         return step
 
     def _aligned(

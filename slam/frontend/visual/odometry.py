@@ -25,7 +25,6 @@ from slam.frames import (
     resized_depth,
     trusted_depth,
 )
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
@@ -53,6 +52,7 @@ from slam.geometry.epipolar import (
 from slam.geometry.resection import consensus, resect
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
+from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
 MIN_INLIERS = 20  # of a measurement: each satisfies both constraints
@@ -110,7 +110,7 @@ class VisualOdometry:
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
         standing: Mask | None = None,
-    ) -> Motion | MeasurementFailure:
+    ) -> Motion | Failed:
         """Measure the motion between two frames, the next two of the sequence or with others left out between them.
 
         Args:
@@ -126,7 +126,7 @@ class VisualOdometry:
         flow = self._predicted_flow(previous, current, depth_previous_unscaled)
         tracks = self._tracker.track(previous, current, flow, standing)
         if len(tracks) < MIN_INLIERS:
-            measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
+            measured: Motion | Failed = Failed(f"only {len(tracks)} corners could be tracked")
         else:
             learned = nearest_depth(depth_previous_unscaled, tracks.previous)
             depth = trusted_depth(learned, height_unscaled)
@@ -237,7 +237,7 @@ class VisualOdometry:
         votes: NDArray[np.bool_],
         learned: FloatArray,
         height: float | None,
-    ) -> Motion | MeasurementFailure | None:
+    ) -> Motion | Failed | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         matches = self._matches(tracks, votes, learned, height, self._dynamic_mask, self.depth_error)
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
@@ -265,7 +265,7 @@ class VisualOdometry:
             alone = step(matches.by_geometry_alone(), MotionHistory())
             credible = most_credible([usual, alone], matches, height, seconds, history)
             if credible is None:
-                return MeasurementFailure("the step contradicts the road and the steps before")
+                return Failed("the step contradicts the road and the steps before")
             chosen = credible
             logger.info("geometry %d -> %d: %s", *ends, "as usual" if chosen is usual else "by corners alone")
         self._learn(tracks, matches, learned, chosen, chosen.speed(height, seconds))
@@ -323,13 +323,11 @@ class VisualOdometry:
         motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)
 
-    def _by_points(
-        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
-    ) -> Motion | MeasurementFailure:
+    def _by_points(self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray) -> Motion | Failed:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth) & votes
         if known.sum() < MIN_INLIERS:
-            return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
+            return Failed(f"only {int(known.sum())} corners have a trusted depth")
         corrected = self.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
@@ -337,7 +335,7 @@ class VisualOdometry:
         count = 0 if start is None else len(start[1])
         if start is None or count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
-            return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
+            return Failed(f"little parallax, and only {known_corners} agree with the learned depth")
         T_start, inliers = start
         resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
         self._fitted = tracks.track_ids[known][inliers]

@@ -10,11 +10,11 @@ import pytest
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.runtime.errors import Failed
 
 FRAMES = 12
 METRES = 4.0  # per unscaled length
@@ -47,7 +47,7 @@ def snippets(T: FloatArray) -> list[SnippetPoses]:
 
 def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
     known = {ends: StepLength(value, 0.02, 0.03) for ends, value in (lengths or {}).items()}
-    return Scale("camera-height", MeasurementFailure("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit")
+    return Scale("camera-height", Failed("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit")
 
 
 def factors(measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = ()) -> list[RelativePose]:

@@ -10,12 +10,11 @@ import pytest
 
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import Failed, SlamError
 
 COUNT = 40
 STEP = from_rotation_vector(np.array([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 1.0]))
@@ -46,7 +45,7 @@ def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Dr
 
 
 def collected(snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any) -> Drive:
-    roads = [MeasurementFailure("not drawn")] * COUNT
+    roads = [Failed("not drawn")] * COUNT
     return Drive(snippets=snippets, motions=list(steps), roads=roads, **others)
 
 

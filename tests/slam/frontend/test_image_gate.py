@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from slam.frames import Frame, Image
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate
+from slam.runtime.errors import Failed
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -33,7 +33,7 @@ def frames_of(images: list[Image]) -> list[Frame]:
 
 def verdicts(images: list[Image], gate: ImageGate | None = None) -> list[str]:
     gate = gate or ImageGate()
-    return [v.reason if isinstance(v, MeasurementFailure) else v for v in map(gate.check, frames_of(images))]
+    return [v.reason if isinstance(v, Failed) else v for v in map(gate.check, frames_of(images))]
 
 
 def jpeg(image: Image, quality: int) -> Image:

@@ -11,7 +11,6 @@ from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.scale.road_plane import GroundPlane
@@ -19,6 +18,7 @@ from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
 from slam.pipeline.observer import Observer
+from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch
 
 
@@ -45,7 +45,7 @@ def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
 ) -> None:
     drive = steps(count, scatter, seconds)
     assert choose(KeyframesConfig(), None, drive) == front_end
-    drive.roads[:] = [MeasurementFailure("no road")] * count
+    drive.roads[:] = [Failed("no road")] * count
     assert choose(KeyframesConfig(), None, drive) != "steps"
 
 

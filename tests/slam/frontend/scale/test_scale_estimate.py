@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from slam.config.sections import ScaleConfig
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import (
     ScaleEstimate,
@@ -16,12 +15,13 @@ from slam.frontend.scale.scale_estimate import (
     scale_from_road,
     scale_track,
 )
+from slam.runtime.errors import Failed
 
 HEIGHT = 0.37
 DOWN = np.array([0.0, 1.0, 0.0])
 
 
-def planes_of(heights) -> list[GroundPlane | MeasurementFailure]:
+def planes_of(heights) -> list[GroundPlane | Failed]:
     return [GroundPlane(height, DOWN, 1.0) for height in heights]
 
 
@@ -55,15 +55,15 @@ def test_over_time_the_median_rejects_wild_frames():
 
 def test_too_few_frames_give_no_scale():
     failure = estimate_scale(np.array([1.0, 1.1, np.nan, 1.0]))
-    assert isinstance(failure, MeasurementFailure)
+    assert isinstance(failure, Failed)
     assert "only 3 frames" in failure.reason
-    assert isinstance(scale_from_road([MeasurementFailure("dark")] * 30, 1.65), MeasurementFailure)
+    assert isinstance(scale_from_road([Failed("dark")] * 30, 1.65), Failed)
 
 
 def test_the_scale_track_follows_a_drifting_unit_across_frames_without_a_plane():
     heights = np.where(np.arange(200) < 100, 0.50, 0.52)
     roads = planes_of(heights)
-    roads[10:40] = [MeasurementFailure("no road")] * 30
+    roads[10:40] = [Failed("no road")] * 30
     estimate = scale_from_road(roads, 1.0)
     track = scale_track(roads, 1.0, estimate)
     assert track.shape == (200,)
@@ -80,7 +80,7 @@ def test_reference_compares_the_first_path_lengths():
     estimate = scale_from_reference(unscaled, true)
     assert estimate.value == pytest.approx(4.0)
     assert estimate.frames_used == 50
-    assert isinstance(scale_from_reference(true * 0 + np.eye(4), true), MeasurementFailure)
+    assert isinstance(scale_from_reference(true * 0 + np.eye(4), true), Failed)
 
 
 @pytest.mark.parametrize(

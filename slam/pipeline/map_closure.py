@@ -126,7 +126,7 @@ class _Rows:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
         views = []
         for segment in self.segments:
-            settled = segment.map.parallax().settled[:, None]
+            settled = segment.map.parallax(segment.map.keyframes).settled[:, None]
             views += views_of(segment.map.keyframes, np.where(settled, segment.map.points, np.nan))
         return views
 

@@ -11,12 +11,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
-from slam.frontend.keyframes.depth_prior import Parallax
 from slam.frontend.keyframes.joining import moved
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment, Parallax, TrackedKeyframe
 from slam.frontend.keyframes.unit import learned_units
 from slam.geometry.resection import MIN_POINTS
 from slam.geometry.se3 import FloatArray, chain, invert
@@ -47,7 +45,9 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
     segment = _held(segment, np.where(tied, along, _UNKNOWN))
     local, keyframes = segment.map, segment.map.keyframes
-    number = np.concatenate([[0], np.cumsum(~(_carries(sigmas) & tied))])
+    begun, carries = np.flatnonzero(sigmas < _BEGUN), sigmas < _CARRIED
+    carries[: begun[0] if len(begun) else None] = True  # before points have parallax
+    number = np.concatenate([[0], np.cumsum(~(carries & tied))])
     pace = _pace([pair for pair, is_tied in zip(pairwise(keyframes), tied, strict=True) if is_tied])
     runs = [rows for n in range(number[-1] + 1) if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES]
     if not runs:
@@ -123,11 +123,3 @@ def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
         sigmas.append(1.0 / np.sqrt(max(_INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1), 1e-9)))
         parallax.see(keyframe.T_camera_world, tracks)
     return np.array(sigmas[1:])
-
-
-def _carries(sigmas: FloatArray) -> NDArray[np.bool_]:
-    """Whether points carry the unit from each keyframe to the next ``(K - 1,)``."""
-    begun = np.flatnonzero(sigmas < _BEGUN)
-    carries = sigmas < _CARRIED
-    carries[: begun[0] if len(begun) else None] = True
-    return carries

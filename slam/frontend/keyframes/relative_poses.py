@@ -73,10 +73,6 @@ class KeyframePoses:
         """Poses of the frames in the first frame of their connected component of maps."""
         return chained(self.poses)
 
-    def frames_of(self, segment: int) -> list[int]:
-        """The frames of a segment."""
-        return [frame for frame, number in self.segments.items() if number == segment]
-
 
 def keyframe_poses(
     maps: Sequence[MapSegment], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()

@@ -41,10 +41,19 @@ def resolve_mode(config: ScaleConfig, camera_height_m: float | None, has_gps: bo
 
 
 def scale_from_road(roads: Sequence[GroundPlane | Failed], camera_height_m: float | None) -> ScaleEstimate | Failed:
-    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none)."""
+    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none).
+
+    The median over the frames without outliers, which are many MADs away.
+    """
     height = 1.0 if camera_height_m is None else camera_height_m
-    ratios = [height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)]
-    return estimate_scale(np.array(ratios))
+    ratios = np.array([height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)])
+    if len(ratios) < MIN_FRAMES:
+        return Failed(f"only {len(ratios)} frames measure the scale, {MIN_FRAMES} are needed")
+    logarithms = np.log(ratios)
+    deviations = np.abs(logarithms - np.median(logarithms))
+    kept = logarithms[deviations <= _REJECTION_SIGMAS * mad_sigma(deviations) + 1e-12]
+    spread = mad_sigma(kept - np.median(kept))
+    return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
 
 def scale_from_reference(
@@ -99,19 +108,6 @@ def scale_from_distance(
     if config.known_m is None or not apart > 0:
         return Failed(f"the camera does not move between frames {first} and {second}")
     return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
-
-
-def estimate_scale(ratios: FloatArray) -> ScaleEstimate | Failed:
-    """One scale from a ratio per frame ``(K,)``: their median without outliers, which are many MADs away."""
-    ratios = np.asarray(ratios, dtype=np.float64)
-    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
-    if len(ratios) < MIN_FRAMES:
-        return Failed(f"only {len(ratios)} frames measure the scale, {MIN_FRAMES} are needed")
-    logarithms = np.log(ratios)
-    deviations = np.abs(logarithms - np.median(logarithms))
-    kept = logarithms[deviations <= _REJECTION_SIGMAS * mad_sigma(deviations) + 1e-12]
-    spread = mad_sigma(kept - np.median(kept))
-    return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
 
 def scale_track(

@@ -50,18 +50,9 @@ class Motion:
 
     @property
     def corner_sigmas(self) -> FloatArray:
-        """Sigmas ``(6,)`` of rotation and direction by the corners' own covariance.
-
-        Raises:
-            ValueError: its direction was not measured separately from its length.
-        """
-        if self.covariance is None:
-            raise ValueError(f"a motion by {self.relative_pose.source} has no separate noise of its direction")
+        """Sigmas ``(6,)`` of rotation and direction by the corners' own covariance, of a triangulated motion."""
+        assert self.covariance is not None
         return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    def with_pose(self, T_from_to: FloatArray) -> Motion:
-        """The same with another pose ``(4, 4)``."""
-        return replace(self, relative_pose=replace(self.relative_pose, T_from_to=T_from_to))
 
     def with_length(
         self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: FloatArray

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.frames import Ends, Intrinsics, RelativePose, runs
-from slam.frontend.drive import Drive
-from slam.frontend.segments import named
+from slam.frontend.drive import Drive, named
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, triangulated

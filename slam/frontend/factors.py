@@ -28,12 +28,9 @@ logger = logging.getLogger(__name__)
 
 
 def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[RelativePose]:
-    """All relative poses with their noise, in the unit of the scale.
+    """All relative poses of a completed drive with their noise, in the unit of the scale.
 
-    Args:
-        drive: completed.
-        scale: of each frame, and the lengths of steps.
-        level: of the line in the log that says what the pose network measured.
+    What the pose network measured is a line in the log of this ``level``.
     """
     maps = drive.map_poses
     geometric = _geometric(drive.steps, scale)

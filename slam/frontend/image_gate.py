@@ -98,16 +98,13 @@ class ImageGate:
             return "repeated"
         self._shrunk, self._difference = shrunk, difference
         if self.was_moving:
-            self._add_change(np.abs(shrunk - before), shrunk)
+            self._moved += 1
+            change = np.abs(shrunk - before)
+            mean = change if self._change is None else self._change
+            self._change = mean + (change - mean) / np.float32(min(self._moved, _REMEMBERED_IMAGES))
+            if self._moved % _STANDING_IMAGES == 0:
+                self.standing = _standing(self._change, shrunk)
         return "new"
-
-    def _add_change(self, change: _Layer, shrunk: _Layer) -> None:
-        """By how much the pixels of a shrunk image ``(h, w)`` changed while the camera moved."""
-        self._moved += 1
-        mean = change if self._change is None else self._change
-        self._change = mean + (change - mean) / np.float32(min(self._moved, _REMEMBERED_IMAGES))
-        if self._moved % _STANDING_IMAGES == 0:
-            self.standing = _standing(self._change, shrunk)
 
 
 def _standing(change: _Layer, shrunk: _Layer) -> Mask | None:
@@ -134,6 +131,10 @@ def _difference(before: _Layer, now: _Layer) -> float:
     """Mean absolute difference over mean gradient: about the motion in pixels, brightness aside."""
     difference = now - before
     difference -= difference.mean()
-    slopes = [cv2.Sobel(before, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
-    gradient = float(np.hypot(*slopes).mean())
+    gradient = float(np.hypot(*slopes_of(before)).mean())
     return float(np.abs(difference).mean()) / max(gradient, _LEAST_GRADIENT)
+
+
+def slopes_of(layer: _Layer) -> list[_Layer]:
+    """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
+    return [np.asarray(cv2.Sobel(layer, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)]

@@ -89,8 +89,7 @@ def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | F
 
 def lidar_steps(path: LidarPath) -> list[RelativePose]:
     """Relative poses of neighbouring frames that both have a scan."""
-    rotation = np.deg2rad(_ROTATION_SIGMA_DEG)
-    sigmas = np.repeat([rotation, _TRANSLATION_SIGMA_M], 3)
+    sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_SIGMA_M], 3)
     T_previous_current = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
     return [
         RelativePose(int(first), int(second), T, sigmas, LIDAR_SOURCE)

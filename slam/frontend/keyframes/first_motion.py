@@ -32,13 +32,7 @@ def first_motion(
 ) -> tuple[FloatArray, FloatArray]:
     """``T_now_before`` of two views, and the depth in the first one ``(M,)``, in the unit of a prior.
 
-    Args:
-        T_now_before: the first start.
-        pixels_before: of corners ``(M, 2)`` in the first view.
-        pixels: in the second.
-        depth: of the corners in the first view by the prior ``(M,)``.
-        intrinsics: of both.
-        seed: of RANSAC.
+    From corners at ``pixels_before`` and ``pixels`` ``(M, 2)`` with ``depth`` ``(M,)`` in the first view by the prior.
     """
     rays_before, rays = intrinsics.rays(pixels_before), intrinsics.rays(pixels)
     tolerance = _INLIER_PX / intrinsics.fx

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Grey, Intrinsics
+from slam.frontend.image_gate import slopes_of
 from slam.frontend.tracking import Pixels
 from slam.geometry.epipolar import rotation_between
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix
@@ -90,8 +91,7 @@ class _Alignment:
         u, v = (x - self._centre[0]) / self._focal[0], (y - self._centre[1]) / self._focal[1]
         self._rays = np.stack([u, v, np.ones_like(u)]).astype(np.float32)
         self._first = first.ravel()
-        gradient = [cv2.Sobel(first, cv2.CV_32F, *axis, scale=0.125).ravel() for axis in ((1, 0), (0, 1))]
-        by_u, by_v = self._focal[0] * gradient[0], self._focal[1] * gradient[1]
+        by_u, by_v = (focal * slope.ravel() for focal, slope in zip(self._focal, slopes_of(first), strict=True))
         # of the first image, by a small turn of its rays
         self._jacobian = np.stack(
             [-by_u * u * v - by_v * (1 + v * v), by_u * (1 + u * u) + by_v * u * v, by_v * u - by_u * v]

@@ -161,10 +161,6 @@ class LocalMap:
         if len(self.keyframes) > _IMAGES_KEPT:
             self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
 
-    def forget_images(self) -> None:
-        """Free the images of a map to which no keyframe will be added."""
-        self.keyframes = [replace(keyframe, grey=None) for keyframe in self.keyframes]
-
     def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
         """Of all points, between those of the keyframes that see them."""
         parallax = Parallax(self.points)
@@ -199,7 +195,10 @@ class LocalMap:
         seen = np.zeros(len(self.points), np.bool_)
         seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
         seen &= np.isfinite(self.points[:, 0])
-        fixed = self._sharing(seen, first)
+        # older keyframes that share most of these points
+        shared = [(int(seen[keyframe.track_ids].sum()), k) for k, keyframe in enumerate(self.keyframes[:first])]
+        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
+        fixed = sorted(k for _, k in best)
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
@@ -233,12 +232,6 @@ class LocalMap:
         dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
         self.points[dead] = np.nan
         return gone, dead
-
-    def _sharing(self, seen: NDArray[np.bool_], first: int) -> list[int]:
-        """The keyframes before ``first`` that share most of the points seen."""
-        shared = [(int(seen[keyframe.track_ids].sum()), k) for k, keyframe in enumerate(self.keyframes[:first])]
-        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
-        return sorted(k for _, k in best)
 
     def sightings(
         self, chosen: Sequence[int], seen: NDArray[np.bool_], intrinsics: Intrinsics

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,8 +159,8 @@ class KeyframeOdometry:
         points = int(local.known(local.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
-            for before in self.segments[:-1]:
-                before.map.forget_images()
+            for before in self.segments[:-1]:  # no keyframe will be added to them
+                before.map.keyframes = [replace(keyframe, grey=None) for keyframe in before.map.keyframes]
             self._note(frame.index, "map begun", support=points)
 
     def locates(self, first: int, last: int) -> bool:
@@ -234,10 +235,8 @@ class KeyframeOdometry:
         local, before = segment.map, segment.map.keyframes[-1]
         rows = np.searchsorted(before.track_ids, track_ids)
         known = local.known(track_ids)
-        if (
-            local.parallax(local.keyframes[-_LOOKED_BACK:]).settled[track_ids].sum() >= MIN_POINTS
-            or known.sum() < MIN_POINTS
-        ):
+        settled = local.parallax(local.keyframes[-_LOOKED_BACK:]).settled[track_ids]
+        if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
         tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, local.points[tracks])[:, 2]

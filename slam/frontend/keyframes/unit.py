@@ -37,9 +37,7 @@ def learned_unit(local: LocalMap) -> float:
 def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Learned depth over depth in the map along it ``(K,)``, and over what each keyframe says of it ``(K,)``.
 
-    Args:
-        local: the map.
-        carried: sigmas of the logarithm of the unit from each keyframe to the next ``(K - 1,)``, a random walk.
+    The logarithm of the unit is a random walk with sigmas ``carried`` ``(K - 1,)`` from each keyframe to the next.
     """
     known = [ratios[ratios > 0.0] for ratios in map(local.ratios, local.keyframes)]
     own = np.array([-float(np.median(np.log(r))) if len(r) >= _LEAST_DEPTHS else np.nan for r in known])
@@ -68,10 +66,7 @@ def _scatter(logarithms: FloatArray) -> float:
 def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0) -> list[float]:
     """The units of maps, so that the camera has one height in all that see a floor; learned ones where it contradicts.
 
-    Args:
-        maps: of one drive.
-        learned_units: of learned depth per unit of each map.
-        seed: of the planes drawn.
+    ``learned_units`` are those of learned depth per unit of each map, ``seed`` is that of the planes drawn.
     """
     units, floors = list(learned_units), {}
     for row, local in enumerate(maps if len(maps) > 1 else ()):

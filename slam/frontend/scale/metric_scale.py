@@ -111,7 +111,7 @@ def find_scale(
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
-        evidence = evidence.without_contradicted(_MAX_CONTRADICTION)
+        evidence.absolute[np.abs(evidence.absolute - evidence.learned) > np.log(_MAX_CONTRADICTION)] = np.nan
     solved = solve_lengths(evidence)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]

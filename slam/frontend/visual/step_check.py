@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.motion import Motion, MotionHistory
 from slam.frontend.visual.two_view import Matches, TwoViewEstimate
 from slam.geometry.epipolar import triangulated_depth
 from slam.geometry.robust import mad_sigma, weighted_median
@@ -84,22 +83,17 @@ def most_credible(
 ) -> Step | None:
     """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
     estimated = [step for step in steps if step is not None]
-    balance = [sum(_votes(step, matches, height_unscaled, seconds, history)) for step in estimated]
+    balance = []
+    for step in estimated:
+        speed = step.speed(height_unscaled, seconds)
+        votes = [history.is_possible_speed(speed, seconds), _fits_ratio(step, speed, history)]
+        votes += [_fits_road(step, matches, height_unscaled), _fits_axis(step, history)]
+        balance.append(sum(1 if vote else -1 for vote in votes if vote is not None))
     best = int(np.argmax(balance))
     return estimated[best] if balance[best] >= 0 else None
 
 
-def _votes(
-    step: Step, matches: Matches, height_unscaled: float | None, seconds: float, history: MotionHistory
-) -> list[int]:
-    """1 for, -1 against, by each measurement that there is."""
-    speed = step.speed(height_unscaled, seconds)
-    votes = [history.is_possible_speed(speed, seconds), _fits_ratio(step, speed, seconds, history)]
-    votes += [_fits_road(step, matches, height_unscaled), _fits_axis(step, history)]
-    return [1 if vote else -1 for vote in votes if vote is not None]
-
-
-def _fits_ratio(step: Step, speed: float, seconds: float, history: MotionHistory) -> bool | None:
+def _fits_ratio(step: Step, speed: float, history: MotionHistory) -> bool | None:
     """Whether points of this step and the one before have the ratio of lengths that learned depth has."""
     if step.motion.length_ratio is None or not history.speeds or not np.isfinite(speed / history.speeds[-1]):
         return None

@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
+from slam.frontend.visual.motion import MotionHistory, MotionPrior
 from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry.epipolar import (

@@ -13,9 +13,8 @@ import pytest
 from erfsfm.common.command_line import Terminal
 from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
-from slam.frontend.drive import Drive
+from slam.frontend.drive import Drive, Segment
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
-from slam.frontend.segments import Segment
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion

@@ -72,11 +72,6 @@ def drive(
     return steps, across, truth
 
 
-def test_without_relative_rotations_steps_stay_as_they_were() -> None:
-    steps, _, _ = drive(np.zeros(3), 0.0)
-    assert smooth_rotations(steps, []) is steps
-
-
 def test_true_steps_and_relative_rotations_stay_true() -> None:
     truth = true_rotations(np.random.default_rng(0))
     across = [RelativeRotation(k, k + 2, truth[k + 1] @ truth[k], np.full(3, SIGMA)) for k in range(STEPS - 1)]
@@ -108,12 +103,6 @@ def test_relative_rotations_across_a_step_that_was_not_measured_are_not_used() -
     assert len(elsewhere) == len(across) - 2
     for ends, R in rotations_of(smooth_rotations(gap, elsewhere)).items():
         np.testing.assert_array_equal(R, smoothed[ends])
-
-
-def test_steps_alone_on_both_sides_of_a_gap_are_kept() -> None:
-    steps, across, _ = drive(np.zeros(3), 0.1 * SIGMA)
-    alone = {ends: steps[ends] for ends in ((0, 1), (20, 21))}
-    assert smooth_rotations(alone, across) is alone
 
 
 def test_steps_that_are_not_triangulated_stay_and_are_not_crossed() -> None:

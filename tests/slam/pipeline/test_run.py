@@ -173,12 +173,6 @@ def test_scale_modes(mode: str, unit_m: float) -> None:
     assert result.scale.estimate.value * FACTOR * unit_m == pytest.approx(1.0, rel=1e-4)
 
 
-def test_auto_without_a_height_is_none() -> None:
-    drive = LevelRoad(turning(30))
-    drive.camera_height_m = None
-    assert run(drive).scale.mode == "none"
-
-
 @pytest.mark.parametrize(
     ("frames", "setting", "words"),
     [

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import room
 
-from slam.frames import KEYFRAME_SOURCE, Intrinsics
-from slam.frontend.keyframes.local_map import LocalMap, TrackIds
+from slam.frames import KEYFRAME_SOURCE
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
@@ -145,22 +144,3 @@ def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn() -> None:
     assert sorted(T) == list(range(len(truth)))
     turned = rotation_angle(np.stack([T[k][:3, :3].T @ truth[k, :3, :3] for k in range(len(truth))]))
     assert np.rad2deg(turned).max() < 3.1
-
-
-def test_the_newest_keyframe_keeps_the_pose_of_its_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
-    adjusted: dict[int, FloatArray] = {}
-    adjust = LocalMap.adjust
-
-    def recorded(local: LocalMap, intrinsics: Intrinsics) -> TrackIds:
-        gone = adjust(local, intrinsics)
-        adjusted[local.keyframes[-1].index] = local.keyframes[-1].T_camera_world
-        return gone
-
-    monkeypatch.setattr(LocalMap, "adjust", recorded)
-    odometry = KeyframeOdometry(room.INTRINSICS)
-    for k, T in enumerate(room.walk(30)):
-        odometry.follow(room.frame(k, T))
-        odometry.learn(room.frame(k, T), room.depth_map(T))
-        newest = odometry.segments[-1].map.keyframes[-1]
-        np.testing.assert_array_equal(newest.T_camera_world, adjusted.get(newest.index, newest.T_camera_world))
-    assert len(adjusted) > 3

@@ -134,13 +134,18 @@ def interpolate_gaps(
         if len(over) > 1 and set(loose).issuperset(over):
             motion |= dict.fromkeys(over, equal_step(pose.T_from_to, len(over)))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
+    gap_steps = []
+    for step in loose:
+        length = max(float(np.linalg.norm(motion[step][:3, 3])), typical, _SIGMA_FLOOR)
+        sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3)
+        gap_steps.append(RelativePose(step, step + 1, motion[step], sigmas, INTERPOLATED_SOURCE))
     return replace(
         drive,
         snippets=filled,
         trusted=trusted,
         motions=list(steps.values()),
         interpolated=dict(sorted(frames.items())),
-        gap_steps=[_interpolated_step(step, motion[step], typical) for step in loose],
+        gap_steps=gap_steps,
         views=[view for view in drive.views if view.index not in frames],
         keyframes=[keyframe for keyframe in drive.keyframes if keyframe.index not in frames],
     )
@@ -261,9 +266,3 @@ def _filled(
             snippet = SnippetPoses(target, tuple(around), T_source_target)
         filled.append(snippet)
     return filled
-
-
-def _interpolated_step(step: int, T_from_to: FloatArray, typical: float) -> RelativePose:
-    length = max(float(np.linalg.norm(T_from_to[:3, 3])), typical, _SIGMA_FLOOR)
-    rotation, translation = np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length
-    return RelativePose(step, step + 1, T_from_to, np.repeat([rotation, translation], 3), INTERPOLATED_SOURCE)

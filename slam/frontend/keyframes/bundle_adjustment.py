@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
-from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.geometry.resection import LEAST_DEPTH, PIXEL_SIGMA, pixel_jacobian
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, apply, compose, make
+from slam.geometry.se3 import FloatArray, apply, compose, from_rotation_vector
 
 _HUBER = 1.5  # sigmas beyond which residuals weigh less
 _FIRST_DAMPING = 1e-4
@@ -110,7 +109,10 @@ class BundleAdjustment:
             step = system.step(damping)
             before = cost
             if step is not None:
-                T_new, X_new = self._moved(T, X, *step)
+                by_camera, by_point = step
+                T_new, X_new = T.copy(), X.copy()
+                T_new[self._free] = compose(from_rotation_vector(by_camera[:, :3], by_camera[:, 3:]), T[self._free])
+                X_new[: self._points] += by_point
                 residuals_new = self.residuals(T_new, X_new)
                 cost_new = self._cost(residuals_new)
                 if cost_new <= cost:
@@ -185,16 +187,6 @@ class BundleAdjustment:
         length = self._lengths(residuals)
         root = np.sqrt(np.minimum(self._huber / np.maximum(length, 1e-12), 1.0))
         return np.asarray(root[:, [0, 0, 1]])
-
-    def _moved(
-        self, T_camera_world: FloatArray, points: FloatArray, by_camera: FloatArray, by_point: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        T = T_camera_world.copy()
-        moved = make(Rotation.from_rotvec(by_camera[:, :3]).as_matrix(), by_camera[:, 3:])
-        T[self._free] = compose(moved, T[self._free])
-        X = points.copy()
-        X[: self._points] += by_point
-        return T, X
 
     def _eliminated_together(self) -> list[_Block]:
         """Points in the order of the first camera that sees them, in blocks that share few cameras."""

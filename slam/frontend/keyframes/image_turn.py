@@ -143,10 +143,7 @@ def turned(pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: In
 def in_middle_row(pixels: _Places, turn: FloatArray, intrinsics: Intrinsics) -> _Places:
     """Pixels ``(M, 2)`` of an image as the camera sees them when the middle row is read.
 
-    Args:
-        pixels: as the image has them.
-        turn: of the camera, rotation vector a second ``(3,)``, as of ``R_current_previous``.
-        intrinsics: of the image.
+    The camera's ``turn`` ``(3,)`` is a rotation vector a second, as of ``R_current_previous``.
     """
     if not intrinsics.readout_s or not len(pixels):
         return pixels
@@ -158,14 +155,9 @@ def in_middle_row(pixels: _Places, turn: FloatArray, intrinsics: Intrinsics) -> 
 def measured_turn(
     before: Pixels | FloatArray, pixels: Pixels, seconds: float, turn: FloatArray, intrinsics: Intrinsics
 ) -> FloatArray:
-    """The turn a second ``(3,)`` between two images; zero with few corners.
+    """The turn a second ``(3,)`` between two images, started from the one before; zero with few corners.
 
-    Args:
-        before: corners in the image before ``(M, 2)``, when its middle row was read.
-        pixels: the same corners in this image ``(M, 2)``, as it has them.
-        seconds: between the images.
-        turn: the one before, to start from.
-        intrinsics: of both images.
+    They were ``before`` ``(M, 2)`` when the middle row was read and are at ``pixels`` ``(M, 2)``, as the image has them.
     """
     if len(pixels) < _LEAST_CORNERS or seconds <= 0:
         return np.zeros(3)

@@ -96,12 +96,8 @@ class KeyframeOdometry:
     ) -> None:
         """Go on in the lost map with the frame that was added last, which becomes a keyframe.
 
-        Args:
-            frame: at the size of the intrinsics.
-            T_camera_world: in the lost map.
-            track_ids: of its points ``(M,)``, each once.
-            pixels: where the frame sees them ``(M, 2)``.
-            place: the frame of the keyframe with most of these points.
+        It sees points of the map, each once, by ``track_ids`` ``(M,)`` at ``pixels`` ``(M, 2)``; ``place`` is the frame
+        of the keyframe with most of these.
         """
         if self.segments[-1].started:
             self._note(self.segments[-1].frames[-self._lost].index, "lost")

@@ -80,7 +80,7 @@ def _held(segment: MapSegment, carried: FloatArray) -> MapSegment:
     T = invert(np.array([keyframe.T_camera_world for keyframe in keyframes]))
     steps = invert(T[:-1]) @ T[1:]
     steps[:, :3, 3] *= np.sqrt(units[:-1] * units[1:])[:, None]
-    held = moved(segment, np.concatenate([np.eye(4)[None], chain(steps)[1:]]), units)
+    held = moved(segment, chain(steps), units)
     pairs = zip(held.map.keyframes, corrections, strict=True)
     held.map.keyframes = [replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs]
     return held

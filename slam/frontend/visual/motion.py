@@ -111,10 +111,7 @@ class RelativeRotation:
 def pose_sigmas(T_previous_current: FloatArray, of_unit_pose: FloatArray, length_relative_sigma: float) -> FloatArray:
     """Sigmas ``(6,)`` of a pose in the current camera, where GTSAM perturbs.
 
-    Args:
-        T_previous_current: the pose ``(4, 4)``.
-        of_unit_pose: sigmas ``(6,)`` of its rotation and direction, radians.
-        length_relative_sigma: of the length.
+    By those ``of_unit_pose`` ``(6,)``, its rotation and direction in radians, and by that of its length.
     """
     along = np.abs(invert(T_previous_current)[:3, 3])
     length = float(np.linalg.norm(along))

@@ -140,11 +140,9 @@ class VisualOdometry:
         return measured
 
     def carried(self, depth_previous_unscaled: DepthMap, motion: Motion) -> DepthMap | None:
-        """Depth ``(h, w)`` at the later frame of a measured motion, NaN where unknown; None where nothing moved.
+        """Depth ``(h, w)`` at the later frame of a motion from that ``(H, W)`` at the earlier one, NaN where unknown.
 
-        Args:
-            depth_previous_unscaled: z-depth ``(H, W)`` of the earlier frame.
-            motion: from it.
+        None where nothing moved.
         """
         known = UnitRelativePose.of(motion.relative_pose.T_from_to)
         if known is None:
@@ -154,13 +152,7 @@ class VisualOdometry:
     def relative_rotation(
         self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
     ) -> Callable[[], RelativeRotation | None]:
-        """Prepare to measure the rotation between two frames some steps apart.
-
-        Args:
-            first: the earlier frame.
-            last: the later frame.
-            depth_first_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
-            T_first_last: the chained motion of the steps, unscaled.
+        """Prepare to measure the rotation between two frames some steps apart, whose motion is about ``T_first_last``.
 
         Returns:
             A function that measures it from the present state, in any thread; its result is None with too few corners.

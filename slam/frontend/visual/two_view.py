@@ -190,14 +190,9 @@ class TwoViewEstimator:
         """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
 
         The majority of the parallax in the image decides on the length by which learned depth is compared, not the
-        majority of corners: those far away are many at times, and their depth is the least certain.
-
-        Args:
-            matches: corners.
-            near: whether they are near their lines ``(M,)``.
-            shift_px: shift along them by learned depth ``(M,)``.
-            seen_px: shift along them as it is ``(M,)``.
-            parallax_px: a larger shift is inlier against learned depth.
+        majority of corners: those far away are many at times, and their depth is the least certain. Shifts ``(M,)``
+        along the lines are ``shift_px`` by learned depth and ``seen_px``; larger ones than ``parallax_px`` are inliers
+        against it.
         """
         known = np.isfinite(matches.depth_previous)
         measured = near & known & (seen_px > 1.0) & (shift_px > 0)

@@ -157,7 +157,7 @@ def measured_turn(
 ) -> FloatArray:
     """The turn a second ``(3,)`` between two images, started from the one before; zero with few corners.
 
-    They were ``before`` ``(M, 2)`` when the middle row was read and are at ``pixels`` ``(M, 2)``, as the image has them.
+    They were ``before`` ``(M, 2)`` when the middle row was read, and are at ``pixels`` ``(M, 2)`` of the image.
     """
     if len(pixels) < _LEAST_CORNERS or seconds <= 0:
         return np.zeros(3)

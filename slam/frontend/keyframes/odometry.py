@@ -203,9 +203,12 @@ class KeyframeOdometry:
         self._slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
-        parallax_ratio = self._parallax_ratio(segment, track_ids, pixels)
-        if self._wants_keyframe(segment, track_ids, pixels, parallax_ratio):
-            if parallax_ratio > _YOUNG_PARALLAX_RATIO:
+        last, is_young = segment.map.keyframes[-1], len(segment.map.keyframes) < _YOUNG_KEYFRAMES
+        parallax, flow = self._moved_since(last, track_ids, pixels)
+        limit = _YOUNG_PARALLAX_RATIO if is_young else _PARALLAX_RATIO
+        are_few = len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS)
+        if are_few or parallax > limit or flow > _MOST_FLOW * limit:
+            if parallax > _YOUNG_PARALLAX_RATIO:
                 self._check_first_motion(segment, track_ids, pixels)
             self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(self._tracked(frame, track_ids, pixels))
@@ -242,26 +245,14 @@ class KeyframeOdometry:
         points = self._intrinsics.rays(pixels_before) * depth[:, None]
         local.points[tracks] = apply(invert(before.T_camera_world), points)
 
-    def _wants_keyframe(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, parallax_ratio: float) -> bool:
-        local, last = segment.map, segment.map.keyframes[-1]
-        if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS):
-            return True
-        limit = _PARALLAX_RATIO if len(local.keyframes) >= _YOUNG_KEYFRAMES else _YOUNG_PARALLAX_RATIO
-        before = last.pixels[np.searchsorted(last.track_ids, track_ids)]
-        moved = float(np.median(np.linalg.norm(pixels - before, axis=1))) / self._intrinsics.width
-        return parallax_ratio > limit or moved > _MOST_FLOW * limit
-
-    def _parallax_ratio(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> float:
-        """The median parallax to the last keyframe over the width of the image."""
-        last, intrinsics = segment.map.keyframes[-1], self._intrinsics
-        if not len(track_ids):
-            return 0.0
+    def _moved_since(self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> tuple[float, float]:
+        """Median parallax, and median shift, of corners ``(M, 2)`` since a keyframe, over the width of the image."""
+        intrinsics, before = self._intrinsics, last.pixels[np.searchsorted(last.track_ids, track_ids)]
         R = self._T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
-        rays_before = intrinsics.rays(last.pixels[np.searchsorted(last.track_ids, track_ids)])
-        parallax = parallax_px(
-            rays_before, intrinsics.rays(pixels.astype(np.float64)), R, (intrinsics.fx, intrinsics.fy)
-        )
-        return float(np.median(parallax)) / intrinsics.width
+        rays_before, rays = intrinsics.rays(before), intrinsics.rays(pixels.astype(np.float64))
+        parallax = parallax_px(rays_before, rays, R, (intrinsics.fx, intrinsics.fy))
+        shift = np.linalg.norm(pixels - before, axis=1)
+        return float(np.median(parallax)) / intrinsics.width, float(np.median(shift)) / intrinsics.width
 
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""

@@ -19,6 +19,7 @@ from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_RELATIVE_SIGMA = 1e-3
 # of the history
+AXIS_SIGMA = float(np.deg2rad(8.0))  # least one of the direction of motion, radians
 _STEPS_KEPT = 100
 _LEAST_STEPS = 10
 _SUDDEN_SHARE = 2.0 / 3.0
@@ -204,7 +205,7 @@ class MotionHistory:
         passed = seconds * (_SPEEDS + 1) / 2
         return abs(speed - usual) < _MOST_ACCELERATION * passed + 3.0 * _LENGTH_RELATIVE_SIGMA * max(speed, usual)
 
-    def prior(self, least_axis_sigma: float) -> MotionPrior:
+    def prior(self) -> MotionPrior:
         """The prior of the next motion; without a direction after too few steps."""
         if len(self.directions) < _LEAST_STEPS:
             return MotionPrior(np.zeros(3), np.inf)
@@ -212,4 +213,4 @@ class MotionHistory:
         axis = np.median(directions, axis=0)
         axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
         spread = mad_sigma(np.arccos(np.clip(directions @ axis, -1.0, 1.0)))
-        return MotionPrior(axis, float(np.hypot(least_axis_sigma, spread)))
+        return MotionPrior(axis, float(np.hypot(AXIS_SIGMA, spread)))

@@ -22,8 +22,6 @@ from slam.geometry.se3 import FloatArray
 # largest log of a length over the same by the road or by triangulated points
 _AGREEMENT = 0.25
 _LEAST_ROAD_CORNERS = 8
-# least sigma of the direction of motion, radians
-_AXIS_SIGMA = float(np.deg2rad(8.0))
 _LEAST_COMMON = 12  # points by which two steps compare their lengths
 
 
@@ -103,7 +101,7 @@ def _fits_ratio(step: Step, speed: float, history: MotionHistory) -> bool | None
 
 def _fits_axis(step: Step, history: MotionHistory) -> bool | None:
     """Whether the direction is about the median of the last hundred steps, which a few wrong ones do not change."""
-    prior = history.prior(_AXIS_SIGMA)
+    prior = history.prior()
     if not np.isfinite(prior.axis_sigma):
         return None
     cosine = abs(float(prior.axis @ step.two_view.unit_pose.direction))

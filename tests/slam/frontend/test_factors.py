@@ -118,7 +118,3 @@ def test_odometry_takes_the_step_from_the_nearest_frame_and_the_last_of_these() 
     wrong = drive(3.0)
     mixed = [pose(0, 2, T=wrong), pose(1, 2, T=wrong), pose(1, 2), pose(0, 1), pose(0, 2, T=wrong)]
     np.testing.assert_allclose(chain_odometry(mixed, 3)[2], TRUE[2], atol=1e-9)
-
-
-def test_odometry_without_geometry_is_the_network() -> None:
-    np.testing.assert_allclose(chain_odometry(by_network(), FRAMES), chain(np.tile(T_OF_NETWORK, (FRAMES - 1, 1, 1))))

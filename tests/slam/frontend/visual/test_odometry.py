@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from slam import frames
 from slam.frames import Frame, Intrinsics, RelativePose
 from slam.frontend.tracking import CornerTracker
 from slam.frontend.visual.motion import Motion
@@ -172,13 +171,6 @@ def test_failures_carry_a_reason(texture):
     failure = measure(rotation, texture, lambda depth: np.full_like(depth, np.nan))
     assert isinstance(failure, Failed)
     assert "trusted depth" in failure.reason
-
-
-def test_far_depth_is_not_trusted(texture, monkeypatch):
-    monkeypatch.setattr(frames, "_TRUSTED_HEIGHTS", 0.5)
-    forward = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    failure = measure(forward, texture)
-    assert isinstance(failure, Failed)
 
 
 def drive(texture, turn_deg=(0.0, 0.0, 0.0), steps=(1.0, 1.0, 1.0, 1.0)):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracle import snippets_of
 
 from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses
 from slam.frontend.drive import Drive, Segment
@@ -32,16 +33,6 @@ def steady(count: int = COUNT) -> FloatArray:
     return chain(np.tile(STEP, (count - 1, 1, 1)))
 
 
-def snippet(T_world_camera: FloatArray, target: int) -> SnippetPoses:
-    sources = tuple(k for k in range(target - 2, target + 3) if k != target)
-    return SnippetPoses(target, sources, invert(T_world_camera[list(sources)]) @ T_world_camera[target])
-
-
-def snippets_of(T_world_camera: FloatArray, unusable: set[int]) -> list[SnippetPoses]:
-    targets = range(2, len(T_world_camera) - 2)
-    return [snippet(T_world_camera, t) for t in targets if not unusable & set(range(t - 2, t + 3))]
-
-
 def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
     T_from_to = invert(T_world_camera[first]) @ T_world_camera[last]
     return Motion(RelativePose(first, last, T_from_to, np.full(6, 0.01), "essential"))
@@ -49,7 +40,7 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
 
 def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
     reasons = dict.fromkeys(unusable, "black")
-    return interpolate_gaps(collected(snippets_of(T_world_camera, unusable), steps, unusable=reasons), 4)
+    return interpolate_gaps(collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4)
 
 
 def collected(snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any) -> Drive:
@@ -58,7 +49,7 @@ def collected(snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **othe
 
 
 def test_a_drive_without_gaps_stays_as_it_was() -> None:
-    snippets, steps = snippets_of(steady(), set()), [measured(steady(), 3, 4)]
+    snippets, steps = snippets_of(steady()), [measured(steady(), 3, 4)]
     found = interpolate_gaps(collected(snippets, steps), 4)
     assert found.snippets == found.trusted == snippets and found.motions == steps
     assert found.gap_steps == [] and found.interpolated == {}
@@ -86,7 +77,7 @@ def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth()
     steps = [measured(steady(), k, k + 1) for k in (*range(14), *range(26, COUNT - 1))]
     unusable = set(range(17, 23))
     found = interpolate_gaps(
-        collected(snippets_of(short, unusable), steps, unusable=dict.fromkeys(unusable, "black")), 4
+        collected(snippets_of(short, unusable=unusable), steps, unusable=dict.fromkeys(unusable, "black")), 4
     )
     for factor in found.gap_steps:
         np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
@@ -139,7 +130,7 @@ def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
     seen = true.copy()
     seen[15:25] = seen[14]
     steps = [measured(seen, k, k + 1) for k in range(COUNT - 1)]
-    return interpolate_gaps(collected(snippets_of(seen, set()), steps, repeated=list(range(15, 25))), 4), true
+    return interpolate_gaps(collected(snippets_of(seen), steps, repeated=list(range(15, 25))), 4), true
 
 
 def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
@@ -159,7 +150,7 @@ def test_repeated_images_of_a_standing_camera_are_measurements() -> None:
 
 def test_repetition_to_the_end_is_standing_still() -> None:
     still = np.tile(np.eye(4), (COUNT, 1, 1))
-    found = interpolate_gaps(collected(snippets_of(still, set()), repeated=list(range(1, COUNT))), 4)
+    found = interpolate_gaps(collected(snippets_of(still), repeated=list(range(1, COUNT))), 4)
     assert found.interpolated == {} and found.gap_steps == []
 
 

@@ -213,7 +213,7 @@ class CornerTracker:
         if corners is None or following is None:
             return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
         tracked = np.isin(corners[1], self._corners[following][1])
-        points, track_ids = (of_corners[tracked] for of_corners in corners)
+        points, track_ids = corners[0][tracked], corners[1][tracked]
 
         def find() -> Tracks:
             pixels, kept = _by_first_flow(previous.grey, current.grey, points, [predicted_flow])

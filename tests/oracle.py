@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
@@ -103,3 +103,14 @@ class _Stream(IntEnum):
     SCALE = 0
     DEPTH = 1
     POSE = 2
+
+
+def snippets_of(T_world_camera: FloatArray, sources: int = 4, unusable: Collection[int] = ()) -> list[SnippetPoses]:
+    """True snippets, one for each target whose frames are all usable."""
+    found, half = [], sources // 2
+    for target in range(half, len(T_world_camera) - half):
+        around = [k for k in range(target - half, target + half + 1) if k != target]
+        if not {target, *around} & set(unusable):
+            T_source_target = invert(T_world_camera[around]) @ T_world_camera[target]
+            found.append(SnippetPoses(target, tuple(around), T_source_target))
+    return found

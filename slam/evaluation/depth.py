@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from slam.runtime.attempt import Failed
+from slam.runtime.errors import Failed
 from slam.runtime.storage.record import Count, Record
 
 LEAST_M, LARGEST_M = 1.0, 80.0

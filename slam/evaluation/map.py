@@ -33,7 +33,7 @@ from slam.evaluation.surface import (
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
 from slam.mapping.views import moved_rows
-from slam.runtime.attempt import Failed
+from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part
 

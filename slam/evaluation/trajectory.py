@@ -27,8 +27,7 @@ from slam.formats.trajectory import (
 )
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.runtime.attempt import Failed
-from slam.runtime.errors import ConfigError, TrajectoryError
+from slam.runtime.errors import ConfigError, Failed, TrajectoryError
 from slam.runtime.storage.record import Count, Record, part
 
 Alignment = Literal["none", "first", "scale", "6dof", "7dof"]

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.frames import Ends, Intrinsics, RelativePose, runs
-from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
-from slam.frontend.segments import named
+from slam.frontend.drive import Drive, named
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, triangulated
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import Failed, SlamError
 
 logger = logging.getLogger(__name__)
 
@@ -216,12 +214,12 @@ def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
     return np.array([found.get(frame, 0.0) for frame in frames])
 
 
-def confidence(agreements: Iterable[Agreement], is_metric: bool, is_carried: bool) -> float | MeasurementFailure:
+def confidence(agreements: Iterable[Agreement], is_metric: bool, is_carried: bool) -> float | Failed:
     """The share of drives with as large a contradiction that err by at most 1 % of their path; where known of such."""
     if is_carried:
-        return MeasurementFailure("it is calibrated on roads, not for a camera that is carried")
+        return Failed("it is calibrated on roads, not for a camera that is carried")
     if not is_metric:
-        return MeasurementFailure("it is calibrated for lengths in metres")
+        return Failed("it is calibrated for lengths in metres")
     return float(share_right(max((each.sigmas for each in agreements), default=0.0), CONFIDENCE))
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field, fields, replace
 from itertools import takewhile
 from typing import TypeVar
 
@@ -23,19 +23,20 @@ from slam.frames import (
     resized_depth,
     runs,
 )
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
-from slam.frontend.segments import Segment
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
 
 MAP_WIDTH_PX = 416  # of the depth that is fused: that of the networks
+_MOST_NAMED = 10  # stretches of frames in a sentence
+LAST_STEPS = 4  # in which the step to one of the last frames is looked up
 DOUBLED = "the image repeats the one before while the camera moves"
 
 
@@ -79,6 +80,15 @@ class Keyframe:
         return np.asarray(points[points[:, 2] > 0])
 
 
+@dataclass(frozen=True)
+class Segment:
+    """Frames ``first`` to ``last`` that no measurement relates to those before; ``reason`` says why it begins."""
+
+    first: int
+    last: int
+    reason: str
+
+
 @dataclass
 class Drive:
     """Measurements of a drive in the networks' unit of length.
@@ -88,12 +98,12 @@ class Drive:
         ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
         ``roads`` has one entry a frame. ``unusable`` are frames without a measurement, with the reason, ``repeated``
         frames with the image of the one before, ``moving`` those of them just before which the camera moved.
+        ``maps`` are those of keyframes and ``events`` what became of them; a drive measured by steps alone has none.
 
     Added by `slam.frontend.gap_interpolation.complete_drive`, which also leaves out views and keyframes of interpolated
     frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
         ``trusted`` are the snippets that the network measured on usable frames, ``interpolated`` the frames of gaps
-        with the reason, ``gap_steps`` their steps. ``maps`` are those of keyframes, ``map_poses`` the poses by them and
-        ``events`` what became of them; a drive measured by steps alone has none.
+        with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by the maps.
     """
 
     snippets: list[SnippetPoses] = field(default_factory=list)
@@ -101,7 +111,7 @@ class Drive:
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: list[RelativeRotation] = field(default_factory=list)
     failures: list[tuple[int, int, str]] = field(default_factory=list)
-    roads: list[GroundPlane | MeasurementFailure] = field(default_factory=list)
+    roads: list[GroundPlane | Failed] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
     unusable: dict[int, str] = field(default_factory=dict)
@@ -135,15 +145,15 @@ class Drive:
         few = [(first, last) for first, last in runs(self.repeated) if last - first < 2 and last < len(self) - 1]
         return [k for first, last in few for k in range(first, last + 1) if k in moving]
 
-    def repeat(self, index: int, moving: bool) -> None:
-        """Add a frame with the image of the one before."""
-        self.repeated.append(index)
-        if moving:
-            self.moving.append(index)
+    def last_step(self, index: int) -> Motion | None:
+        """The step to one of the last frames, where image geometry measured it."""
+        return next((motion for motion in self.motions[-LAST_STEPS:] if motion.ends[1] == index), None)
 
     def copy(self) -> Drive:
         """A snapshot: what is measured later is added to one of both alone."""
-        return Drive(**{name: getattr(self, name).copy() for name in _COLLECTED})
+        return Drive(
+            **{each.name: getattr(self, each.name).copy() for each in fields(self) if each.name != "map_poses"}
+        )
 
     def since(self, first: int) -> Drive:
         """The measurements from frame ``first`` on, which becomes frame 0; without views and keyframes.
@@ -178,13 +188,15 @@ class Drive:
         )
 
 
-_COLLECTED = (
-    *("snippets", "motions", "road_steps", "relative_rotations", "failures", "roads"),
-    *("views", "keyframes", "unusable", "repeated", "moving"),
-)
-
 _Between = TypeVar("_Between", RelativePose, RelativeRotation)
 
 
 def _moved(measured: _Between, first: int) -> _Between:
     return replace(measured, from_index=measured.from_index - first, to_index=measured.to_index - first)
+
+
+def named(frames: Collection[int]) -> str:
+    """Stretches of frames in words, the first ten of them."""
+    found = runs(frames)
+    words = [f"{first} to {last}" if last > first else str(first) for first, last in found[:_MOST_NAMED]]
+    return ", ".join(words) + ", ..." * (len(found) > _MOST_NAMED)

@@ -28,12 +28,9 @@ logger = logging.getLogger(__name__)
 
 
 def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[RelativePose]:
-    """All relative poses with their noise, in the unit of the scale.
+    """All relative poses of a completed drive with their noise, in the unit of the scale.
 
-    Args:
-        drive: completed.
-        scale: of each frame, and the lengths of steps.
-        level: of the line in the log that says what the pose network measured.
+    What the pose network measured is a line in the log of this ``level``.
     """
     maps = drive.map_poses
     geometric = _geometric(drive.steps, scale)
@@ -62,14 +59,11 @@ def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePo
 
 def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:
     """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
-    units = {number: maps.learned_units[number] * unit for number, unit in depth_units(maps, scale).items()}
+    units = {}
+    for segment in set(maps.segments.values()):
+        frames = [frame for frame, number in maps.segments.items() if number == segment]
+        units[segment] = maps.learned_units[segment] * float(np.median(scale.per_frame[frames]))
     return [pose.scaled(units[maps.segments[pose.from_index]]) for pose in poses]
-
-
-def depth_units(maps: KeyframePoses, scale: Scale) -> dict[int, float]:
-    """The unit of the scale per learned depth in each map, by the map's number."""
-    numbers = set(maps.segments.values())
-    return {number: float(np.median(scale.per_frame[maps.frames_of(number)])) for number in numbers}
 
 
 def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
@@ -106,7 +100,7 @@ def _geometric(steps: Steps, scale: Scale) -> list[RelativePose]:
         if not motion.is_triangulated or length is None:
             factors.append(scale.scaled(motion.relative_pose))
             continue
-        pose = motion.with_length(length.value, length.relative_sigma, length.relative_correlated_sigma, noise[ends])
+        pose = motion.with_length(*length, noise[ends])
         factors.append(replace(pose, student_t_dof=STUDENT_T_DOF))
     return factors
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
 from itertools import pairwise
@@ -10,14 +10,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
-from slam.frontend.drive import Drive
-from slam.frontend.keyframes.local_map import MapSegment
+from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, runs
+from slam.frontend.drive import Drive, Segment
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
 from slam.frontend.network_factors import calibrate_network, network_steps
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.scale.road_slope import with_slope
-from slam.frontend.segments import find_cuts, find_segments
 from slam.frontend.visual.motion import Motion, Steps
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError
@@ -28,6 +26,7 @@ _STEPS_OF_A_MOTION = 3
 _LONGEST_START = 2.0
 # frames without a usable image between a frozen video and the first new image
 _LONGEST_DOUBT = 2
+_LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
 _SIGMA_FLOOR = 1e-6
 _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
 _TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
@@ -37,20 +36,13 @@ _NO_MAPS = KeyframePoses()
 def complete_drive(
     drive: Drive,
     sources: int,
-    maps: Sequence[MapSegment] = (),
     map_poses: KeyframePoses = _NO_MAPS,
-    events: Sequence[TrackingEvent] = (),
+    joins: Sequence[TrackingEvent] = (),
 ) -> Drive:
     """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
 
-    More frames may follow.
-
-    Args:
-        drive: as collected; it stays as it is.
-        sources: sources of a snippet.
-        maps: of keyframes.
-        map_poses: by these maps.
-        events: what became of the maps.
+    More frames may follow: the collected drive stays as it is. ``sources`` are those of a snippet, ``map_poses`` are by
+    its maps of keyframes, which loops join at ``joins``.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
@@ -64,10 +56,47 @@ def complete_drive(
         motions=list(smoothed.values()),
         road_steps=with_slope(drive.road_steps, smoothed),
         segments=find_segments(len(drive), cuts, filled.interpolated, map_poses.relates),
-        maps=list(maps),
         map_poses=map_poses,
-        events=sorted(events, key=lambda event: event.frame),
+        events=sorted([*drive.events, *joins], key=lambda event: event.frame),
     )
+
+
+def find_cuts(
+    failures: Sequence[tuple[int, int, str]], measured: Collection[Ends], doubtful: Collection[int]
+) -> list[int]:
+    """Frames that show another place than the frame before: their step failed, the steps before and after did not.
+
+    Args:
+        failures: steps that image geometry could not measure, and why.
+        measured: steps that it measured.
+        doubtful: frames that are unusable or repeat the one before.
+    """
+    ends = set(measured)
+    longer = [(a, b) for a, b in ends if b - a > 1]
+    cuts = []
+    for first, last, _ in failures:
+        around = {first - 1, first, last, last + 1}
+        alone = last == first + 1 and (first - 1, first) in ends and (last, last + 1) in ends
+        if alone and around.isdisjoint(doubtful) and not any(a < last <= b for a, b in longer):
+            cuts.append(last)
+    return sorted(set(cuts))
+
+
+def find_segments(
+    count: int, cuts: Collection[int], interpolated: Mapping[int, str], is_related: Callable[[int], bool]
+) -> list[Segment]:
+    """The segments of a drive of so many frames, by its cuts and its long gaps.
+
+    ``is_related`` tells of a frame whether a map of keyframes relates the frames from it on to those before.
+    """
+    between = [cut for cut in cuts if not is_related(cut)]
+    begins = {0: ""} | dict.fromkeys(between, "it shows another place than the frame before")
+    ends = {count - 1} | {cut - 1 for cut in between}
+    for first, last in runs(interpolated):
+        if last - first + 1 > _LONGEST_GAP and first > 0 and last + 1 < count and not is_related(last + 1):
+            ends.add(first - 1)
+            begins[last + 1] = f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
+    return [Segment(first, last, begins[first]) for first, last in zip(sorted(begins), sorted(ends), strict=True)]
 
 
 def interpolate_gaps(
@@ -75,11 +104,8 @@ def interpolate_gaps(
 ) -> Drive:
     """The drive with steps and snippets in its gaps, and without what was measured on interpolated frames.
 
-    Args:
-        drive: its snippets are on usable frames; its steps over a gap are between the two ends.
-        sources: sources of a snippet.
-        cuts: frames that show another place than the one before: no snippet measures across them.
-        map_poses: by maps of keyframes, where steps are not measured.
+    Steps over a gap are between its two ends. No snippet measures across ``cuts``, which show another place than the
+    frame before.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
@@ -103,15 +129,23 @@ def interpolate_gaps(
     covered = {step for s in trusted for step in range(min(s.sources), max(s.sources))} | by_image.keys()
     loose = [step for step in range(count - 1) if step not in covered]
     motion = _completed(known, loose)
-    motion |= _equal_steps(_poses(steps), set(loose))
+    for pose in _poses(steps):  # over gaps
+        over = range(*pose.ends)
+        if len(over) > 1 and set(loose).issuperset(over):
+            motion |= dict.fromkeys(over, equal_step(pose.T_from_to, len(over)))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
+    gap_steps = []
+    for step in loose:
+        length = max(float(np.linalg.norm(motion[step][:3, 3])), typical, _SIGMA_FLOOR)
+        sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3)
+        gap_steps.append(RelativePose(step, step + 1, motion[step], sigmas, INTERPOLATED_SOURCE))
     return replace(
         drive,
         snippets=filled,
         trusted=trusted,
         motions=list(steps.values()),
         interpolated=dict(sorted(frames.items())),
-        gap_steps=[_interpolated_step(step, motion[step], typical) for step in loose],
+        gap_steps=gap_steps,
         views=[view for view in drive.views if view.index not in frames],
         keyframes=[keyframe for keyframe in drive.keyframes if keyframe.index not in frames],
     )
@@ -174,17 +208,6 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
     return {**known, **dict(zip(unknown, T, strict=True))}
 
 
-def _equal_steps(geometric: Sequence[RelativePose], loose: set[int]) -> dict[int, FloatArray]:
-    """Equal steps over each gap whose two ends are linked by image geometry."""
-    equal_steps: dict[int, FloatArray] = {}
-    for factor in geometric:
-        steps = range(factor.from_index, factor.to_index)
-        if len(steps) > 1 and loose.issuperset(steps):
-            T_step = equal_step(factor.T_from_to, len(steps))
-            equal_steps |= dict.fromkeys(steps, T_step)
-    return equal_steps
-
-
 def equal_step(T_a_b: FloatArray, n: int) -> FloatArray:
     """One of n equal steps from a to b: the transform ``(4, 4)`` whose n-th power is ``T_a_b``."""
     rotation_vector = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
@@ -243,9 +266,3 @@ def _filled(
             snippet = SnippetPoses(target, tuple(around), T_source_target)
         filled.append(snippet)
     return filled
-
-
-def _interpolated_step(step: int, T_from_to: FloatArray, typical: float) -> RelativePose:
-    length = max(float(np.linalg.norm(T_from_to[:3, 3])), typical, _SIGMA_FLOOR)
-    rotation, translation = np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length
-    return RelativePose(step, step + 1, T_from_to, np.repeat([rotation, translation], 3), INTERPOLATED_SOURCE)

@@ -14,12 +14,12 @@ import numpy as np
 from slam.config.sections import GpsConfig
 from slam.formats.trajectory import nearest_stamps
 from slam.frames import MeasuredPosition
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate
 from slam.geometry import se3
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
 
@@ -55,12 +55,12 @@ class GpsFixes:
         return np.column_stack([np.interp(self.stamps, stamps, T_any_camera[:, axis, 3]) for axis in range(3)])
 
 
-def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes | MeasurementFailure:
+def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes | Failed:
     """The fixes of a track between the first and the last of the frames' ``stamps`` ``(N,)``."""
     shifted = track.stamps + config.offset_s
     inside = (shifted >= stamps[0]) & (shifted <= stamps[-1])
     if inside.sum() < _LEAST_FIXES:
-        return MeasurementFailure(
+        return Failed(
             f"{int(inside.sum())} GPS fixes lie between the first and the last frame: the track has stamps from "
             f"{shifted[0]:.1f} to {shifted[-1]:.1f} s, the frames from {stamps[0]:.1f} to {stamps[-1]:.1f} s: set "
             "gps.offset_s, or give the track of this drive"
@@ -73,9 +73,7 @@ def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes
     return GpsFixes(times, points, sigmas, widening, frame)
 
 
-def scale_by_gps(
-    fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray
-) -> ScaleEstimate | MeasurementFailure:
+def scale_by_gps(fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray) -> ScaleEstimate | Failed:
     """The ratio of chords by GPS to chords of the estimate: the median, so that drift and outliers count little.
 
     Errors of fixes lengthen a chord by about their variance over its length. So chords are a tenth of the fixes, or
@@ -98,7 +96,7 @@ def scale_by_gps(
     lengths = metres * chords(tenth)[1]
     usable = lengths > least
     if usable.sum() < MIN_FRAMES:
-        return MeasurementFailure(
+        return Failed(
             f"the camera moves too little: {int(usable.sum())} stretches of a tenth of the fixes span over "
             f"{least:.1f} m, five sigmas, and move in the images; {MIN_FRAMES} are needed, and the longest spans "
             f"{lengths.max():.1f} m; gps.sigma_m may be smaller for a good receiver"
@@ -111,14 +109,14 @@ def scale_by_gps(
     return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))
 
 
-def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> FloatArray | MeasurementFailure:
+def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> FloatArray | Failed:
     """``T_enu_world`` ``(4, 4)`` by the fixes, robustly; about a straight path by the camera's own up."""
     camera = fixes.camera(T_world_camera, stamps)
     sigma = fixes.sigmas * fixes.widening
     extent = float(np.ptp(fixes.points[:, :2], axis=0).max())
     least = _LEAST_MOTION_SIGMAS * float(np.median(sigma[:, 0]))
     if extent < least:
-        return MeasurementFailure(
+        return Failed(
             f"the camera moves too little for GPS to tell its heading: {extent:.1f} m, and {least:.1f} m are needed "
             "with these gps.sigma_m and gps.correlation_s"
         )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Frame, Grey, Mask
-from slam.frontend.failure import MeasurementFailure
+from slam.runtime.errors import Failed
 
 _THUMBNAIL = (32, 16)  # width, height
 _SHRINKING = 4  # averages out compression noise
@@ -34,7 +34,7 @@ _BRIGHT_GREY = 235.0  # the sky does not change where the camera sees white
 _STANDING_IMAGES, _REMEMBERED_IMAGES = 20, 50
 _REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
 
-Verdict = Literal["new", "repeated"] | MeasurementFailure
+Verdict = Literal["new", "repeated"] | Failed
 _Layer = NDArray[np.float32]
 
 
@@ -64,7 +64,7 @@ class ImageGate:
         """Whether an image shows something new, repeats the one before (also after compression), or is unusable."""
         if self._last is None or not np.array_equal(frame.image, self._last.image):
             self._verdict = self._classify(frame)
-        elif not isinstance(self._verdict, MeasurementFailure):
+        elif not isinstance(self._verdict, Failed):
             self._verdict = "repeated"
         self._last = frame
         return self._verdict
@@ -74,11 +74,11 @@ class ImageGate:
         if contrast < _BLANK_CONTRAST:
             # images after a dark one are not compared with those before it
             self._shrunk, self._difference = None, 0.0
-            return MeasurementFailure("the image is blank")
+            return Failed("the image is blank")
         shrunk = _shrunk(frame.grey)
         thumbnail = cv2.resize(shrunk, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         if float(thumbnail.std()) < _NOISE_CONTRAST * contrast:
-            return MeasurementFailure("the image is noise")
+            return Failed("the image is noise")
         return self._compared(shrunk)
 
     def _compared(self, shrunk: _Layer) -> Verdict:
@@ -98,16 +98,13 @@ class ImageGate:
             return "repeated"
         self._shrunk, self._difference = shrunk, difference
         if self.was_moving:
-            self._add_change(np.abs(shrunk - before), shrunk)
+            self._moved += 1
+            change = np.abs(shrunk - before)
+            mean = change if self._change is None else self._change
+            self._change = mean + (change - mean) / np.float32(min(self._moved, _REMEMBERED_IMAGES))
+            if self._moved % _STANDING_IMAGES == 0:
+                self.standing = _standing(self._change, shrunk)
         return "new"
-
-    def _add_change(self, change: _Layer, shrunk: _Layer) -> None:
-        """By how much the pixels of a shrunk image ``(h, w)`` changed while the camera moved."""
-        self._moved += 1
-        mean = change if self._change is None else self._change
-        self._change = mean + (change - mean) / np.float32(min(self._moved, _REMEMBERED_IMAGES))
-        if self._moved % _STANDING_IMAGES == 0:
-            self.standing = _standing(self._change, shrunk)
 
 
 def _standing(change: _Layer, shrunk: _Layer) -> Mask | None:
@@ -134,6 +131,10 @@ def _difference(before: _Layer, now: _Layer) -> float:
     """Mean absolute difference over mean gradient: about the motion in pixels, brightness aside."""
     difference = now - before
     difference -= difference.mean()
-    slopes = [cv2.Sobel(before, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
-    gradient = float(np.hypot(*slopes).mean())
+    gradient = float(np.hypot(*slopes_of(before)).mean())
     return float(np.abs(difference).mean()) / max(gradient, _LEAST_GRADIENT)
+
+
+def slopes_of(layer: _Layer) -> list[_Layer]:
+    """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
+    return [np.asarray(cv2.Sobel(layer, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)]

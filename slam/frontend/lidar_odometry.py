@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.progress import Progress, silent
 from slam.frames import RelativePose, Sequence
-from slam.frontend.failure import MeasurementFailure
 from slam.geometry.se3 import FloatArray, invert
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import Failed, SlamError
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +50,7 @@ def readable_scan(sequence: Sequence, frame: int) -> FloatArray | str:
         return str(error)
 
 
-def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | MeasurementFailure | None:
+def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | Failed | None:
     """Register the scans of a sequence one after the other; None where it has fewer than two.
 
     Scans that cannot be read are left out, with one warning; a failure, without one, where fewer than two can.
@@ -81,7 +80,7 @@ def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | M
     if unreadable:
         found = f"{len(unreadable)} of {len(scanned)} LiDAR scans cannot be read, first {min(unreadable.items())[1]}"
         if len(frames) < LEAST_SCANS:
-            return MeasurementFailure(found)
+            return Failed(found)
         logger.warning("%s: they are left out", found)
     T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)
     logger.info("kiss-icp registered %d scans", len(frames))
@@ -90,8 +89,7 @@ def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | M
 
 def lidar_steps(path: LidarPath) -> list[RelativePose]:
     """Relative poses of neighbouring frames that both have a scan."""
-    rotation = np.deg2rad(_ROTATION_SIGMA_DEG)
-    sigmas = np.repeat([rotation, _TRANSLATION_SIGMA_M], 3)
+    sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_SIGMA_M], 3)
     T_previous_current = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
     return [
         RelativePose(int(first), int(second), T, sigmas, LIDAR_SOURCE)
@@ -100,16 +98,16 @@ def lidar_steps(path: LidarPath) -> list[RelativePose]:
     ]
 
 
-def usable_steps(path: LidarPath | MeasurementFailure | None, are_needed: bool) -> list[RelativePose]:
+def usable_steps(path: LidarPath | Failed | None, are_needed: bool) -> list[RelativePose]:
     """The steps of a path, with a warning where it failed.
 
     Raises:
         SlamError: there are none, and they ``are_needed`` for all lengths.
     """
     steps = lidar_steps(path) if isinstance(path, LidarPath) else []
-    reason = path.reason if isinstance(path, MeasurementFailure) else "no two neighbouring scans can be read"
+    reason = path.reason if isinstance(path, Failed) else "no two neighbouring scans can be read"
     if are_needed and not steps:
         raise SlamError(f"scale.mode=lidar: {reason}: leave the setting out, or give a sequence with scans")
-    if isinstance(path, MeasurementFailure):
+    if isinstance(path, Failed):
         logger.warning("%s: the run goes on without LiDAR", reason)
     return steps

@@ -84,14 +84,11 @@ def calibrate_network(
     """The unit and the noise of the network's steps, by the poses that image geometry measured too.
 
     At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths are in the unit of
-    learned depth, and accordingly uncertain.
-
-    Args:
-        steps: ``T_k_next`` of the network, unscaled.
-        geometric: relative poses in the unit wanted.
-        depth_unit: ``(N,)``, the unit wanted per unit of learned depth at each frame.
+    learned depth, and accordingly uncertain. Steps ``T_k_next`` are unscaled; ``depth_unit`` ``(N,)`` is the unit of
+    the ``geometric`` poses per unit of learned depth at each frame.
     """
-    pairs = [p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR and steps.keys() >= _between(p)]
+    measured = (p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR)
+    pairs = [p for p in measured if steps.keys() >= set(range(*p.ends))]
     if len(pairs) < LEAST_PAIRS:
         return _by_depth(depth_unit, len(pairs))
     first, last = np.array([p.ends for p in pairs]).T
@@ -136,11 +133,8 @@ def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibra
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     """The raw network trajectory: target to next source of each snippet, without a graph.
 
-    Frames before the first target and after the last come from the direct poses of these two snippets.
-
-    Args:
-        snippets: one per target, in time order without gaps, of a completed drive.
-        count: frames of the sequence.
+    Frames before the first target and after the last come from the direct poses of these two snippets. There is one a
+    target, in time order without gaps.
 
     Returns:
         ``T_world_camera`` ``(count, 4, 4)``, unscaled, the first the identity.
@@ -154,10 +148,6 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
 def _steps(snippet: SnippetPoses) -> dict[int, FloatArray]:
     T_target = snippet.T_target_camera
     return {k: invert(T_target[k]) @ T_target[k + 1] for k in range(min(snippet.sources), max(snippet.sources))}
-
-
-def _between(pose: RelativePose) -> set[int]:
-    return set(range(pose.from_index, pose.to_index))
 
 
 def _by_depth(depth_unit: FloatArray, pairs: int) -> NetworkCalibration:

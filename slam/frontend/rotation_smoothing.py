@@ -9,6 +9,7 @@ far move it to the other side: the direction of a step is corrected by as much a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -30,11 +31,8 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
     """The steps with rotations fitted robustly to single steps and relative rotations, directions corrected alike.
 
     Least squares over one small rotation for each triangulated step, in its current camera. The residual of a
-    relative rotation is the sum of the corrections of its steps, each in its last camera.
-
-    Args:
-        steps: of a drive.
-        relative_rotations: rotations over a step that is not triangulated are not used.
+    relative rotation is the sum of the corrections of its steps, each in its last camera. Rotations over a step that is
+    not triangulated are not used.
     """
     motions = triangulated(steps)
     by_start = shortest_by_start(motions)
@@ -60,16 +58,15 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
     T_current_previous[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ T_current_previous[:, :3, :3]
     covariances = np.array([motion.covariance for motion in motions.values()])
     moves = covariances[:, 3:, :3] @ np.linalg.solve(covariances[:, :3, :3], turns[:, :, None])
-    T_current_previous[:, :3, 3] = _turned(T_current_previous[:, :3, 3], moves[:, :, 0])
-    smoothed = zip(motions.items(), invert(T_current_previous), strict=True)
-    return {**steps, **{ends: motion.with_pose(T) for (ends, motion), T in smoothed}}
-
-
-def _turned(translations: FloatArray, directions: FloatArray) -> FloatArray:
-    """Translations ``(S, 3)`` with ``directions`` ``(S, 3)`` added to their own, as long as before."""
-    lengths = np.linalg.norm(translations, axis=1, keepdims=True)
-    turned = translations + lengths * directions
-    return np.asarray(turned * lengths / np.linalg.norm(turned, axis=1, keepdims=True))
+    directions = T_current_previous[:, :3, 3]
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = directions + lengths * moves[:, :, 0]
+    T_current_previous[:, :3, 3] = turned * lengths / np.linalg.norm(turned, axis=1, keepdims=True)
+    smoothed = {
+        ends: replace(motion, relative_pose=replace(motion.relative_pose, T_from_to=T))
+        for (ends, motion), T in zip(motions.items(), invert(T_current_previous), strict=True)
+    }
+    return {**steps, **smoothed}
 
 
 def _equations(

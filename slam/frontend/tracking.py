@@ -56,14 +56,14 @@ class Texture(NamedTuple):
 OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half the time of 15
 OF_KEYFRAMES = Search(side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
-MAX_CORNERS, CORNER_SPACING_PX = 800, 11.0  # of a step: twice as many change no error and take twice the time
+MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
+STEP_CORNERS = Texture(quality=0.008, spacing_px=11.0, block_px=5)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
 ROTATION_BASELINE = 2  # steps between frames whose rotation is also measured directly: halves its error
 FEW_CORNERS = 60  # tracks below which they are sought again, with the wide window and equal exposure
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
-_STEP_QUALITY, _STEP_BLOCK_PX = 0.008, 5
 
 
 def track(
@@ -80,32 +80,27 @@ def track(
     """
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
-    moved, forward = _lucas_kanade(first, second, pixels, search.side, search.levels, search.limits, guesses)
+    guesses = pixels if guesses is None else guesses
+    moved, forward = _lucas_kanade(first, second, pixels, guesses, search.side, search.levels, search.limits)
     levels, limits = search.back or (search.levels, search.limits)
-    start = None if search.back is None else pixels
-    returned, backward = _lucas_kanade(second, first, moved, search.side, levels, limits, start)
+    start = moved if search.back is None else pixels
+    returned, backward = _lucas_kanade(second, first, moved, start, search.side, levels, limits)
     near = np.linalg.norm(returned - pixels, search.norm, axis=1) < search.error_px
     return moved, forward & backward & near
 
 
 def _lucas_kanade(
-    first: Grey,
-    second: Grey,
-    pixels: Pixels,
-    side: int,
-    levels: int,
-    limits: tuple[int, float],
-    guesses: Pixels | None,
+    first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, side: int, levels: int, limits: tuple[int, float]
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         first,
         second,
         pixels.reshape(-1, 1, 2),
-        None if guesses is None else guesses.reshape(-1, 1, 2).copy(),
+        guesses.reshape(-1, 1, 2).copy(),
         winSize=(side, side),
         maxLevel=levels,
         criteria=(_TERMINATION, *limits),
-        flags=0 if guesses is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=_LEAST_TEXTURE,
     )
     return moved.reshape(-1, 2), status.ravel().astype(bool)
@@ -178,21 +173,13 @@ class Tracks:
         return len(self.track_ids)
 
 
-@dataclass(frozen=True)
-class Corners:
-    """Corners of one image: pixels ``(M, 2)`` and ``track_ids`` ``(M,)``."""
-
-    pixels: Pixels
-    track_ids: NDArray[np.int64]
-
-
 class CornerTracker:
     """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
     def __init__(self) -> None:
-        self._corners: dict[int, Corners] = {}  # of the last frames
+        # of the last frames: pixels (M, 2) and the identifiers of their tracks (M,)
+        self._corners: dict[int, tuple[Pixels, NDArray[np.int64]]] = {}
         self._next_track_id = 0
-        self._frames_kept = ROTATION_BASELINE + 2
 
     def track(
         self,
@@ -205,17 +192,16 @@ class CornerTracker:
 
         The flow between them may be predicted; pixels that are ``standing`` ``(h, w)`` do not belong to the world.
         """
-        corners = self._corners.get(previous.index)
-        if corners is None:
-            corners = self._filled(previous, Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64)), standing)
-        forward, kept = self._tracked(previous, current, corners.pixels, predicted_flow)
+        if previous.index not in self._corners:
+            self._fill(previous, np.zeros((0, 2), np.float32), np.zeros(0, np.int64), standing)
+        pixels, track_ids = self._corners[previous.index]
+        forward, kept = _tracked(previous.grey, current.grey, pixels, predicted_flow)
         if standing is not None:
             kept &= ~nearest(resized_mask(standing, *current.grey.shape[::-1]), forward)
-        track_ids = corners.track_ids[kept]
         if current.index not in self._corners:
-            self._filled(current, Corners(forward[kept], track_ids), standing)
-        before, now = corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
-        return Tracks(before, now, track_ids, len(kept))
+            self._fill(current, forward[kept], track_ids[kept], standing)
+        before, now = pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
+        return Tracks(before, now, track_ids[kept], len(kept))
 
     def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
         """Prepare to track corners of ``previous`` to a frame some steps later.
@@ -226,8 +212,8 @@ class CornerTracker:
         following = min((index for index in self._corners if index > previous.index), default=None)
         if corners is None or following is None:
             return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
-        tracked = np.isin(corners.track_ids, self._corners[following].track_ids)
-        points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
+        tracked = np.isin(corners[1], self._corners[following][1])
+        points, track_ids = corners[0][tracked], corners[1][tracked]
 
         def find() -> Tracks:
             pixels, kept = _by_first_flow(previous.grey, current.grey, points, [predicted_flow])
@@ -236,35 +222,28 @@ class CornerTracker:
 
         return find
 
-    def _tracked(
-        self, first: Frame, second: Frame, points: Pixels, predicted_flow: PredictedFlow | None
-    ) -> tuple[Pixels, NDArray[np.bool_]]:
-        """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
-        flows = [predicted_flow, None] if predicted_flow else [None]
-        pixels, kept = _by_first_flow(first.grey, second.grey, points, flows)
-        if kept.sum() < FEW_CORNERS:
-            exposed = _histogram_matched(second.grey, first.grey)
-            pixels_wide, kept_wide = _by_first_flow(first.grey, exposed, points, flows, _WIDE_WINDOW_PX)
-            if kept_wide.sum() > kept.sum():
-                return pixels_wide, kept_wide
-        return pixels, kept
-
-    def _filled(self, frame: Frame, arrived: Corners, standing: Mask | None) -> Corners:
+    def _fill(self, frame: Frame, pixels: Pixels, track_ids: NDArray[np.int64], standing: Mask | None) -> None:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
-        next_id = self._next_track_id
-        pixels, track_ids = arrived.pixels, arrived.track_ids
-        room = MAX_CORNERS - len(pixels)
-        if room > 0:
-            texture = Texture(_STEP_QUALITY, CORNER_SPACING_PX, _STEP_BLOCK_PX)
-            fresh = new_corners(frame.grey, pixels, room, texture, standing)
-            pixels = np.concatenate([pixels, fresh])
-            track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])
-            next_id += len(fresh)
-        corners = Corners(pixels, track_ids)
-        self._corners[frame.index], self._next_track_id = corners, next_id
-        for index in sorted(self._corners)[: -self._frames_kept]:
+        fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels), STEP_CORNERS, standing)
+        new_ids = self._next_track_id + np.arange(len(fresh))
+        self._corners[frame.index] = np.concatenate([pixels, fresh]), np.concatenate([track_ids, new_ids])
+        self._next_track_id += len(fresh)
+        for index in sorted(self._corners)[: -ROTATION_BASELINE - 2]:
             del self._corners[index]
-        return corners
+
+
+def _tracked(
+    first: Grey, second: Grey, points: Pixels, predicted_flow: PredictedFlow | None
+) -> tuple[Pixels, NDArray[np.bool_]]:
+    """Points ``(M, 2)`` tracked to the second image, and which are reliable ``(M,)``; with wide windows if few."""
+    flows = [predicted_flow, None] if predicted_flow else [None]
+    pixels, kept = _by_first_flow(first, second, points, flows)
+    if kept.sum() < FEW_CORNERS:
+        exposed = _histogram_matched(second, first)
+        pixels_wide, kept_wide = _by_first_flow(first, exposed, points, flows, _WIDE_WINDOW_PX)
+        if kept_wide.sum() > kept.sum():
+            return pixels_wide, kept_wide
+    return pixels, kept
 
 
 def _by_first_flow(

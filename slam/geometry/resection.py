@@ -27,7 +27,7 @@ _DAMPING = 1e-13  # of the trace: points hardly in front of the camera leave a m
 _DOUBTFUL_RATIO = 0.75
 _CLEARLY = 2.0  # times the support of the pose by all points, of that by trusted ones in its place
 _SAMPLES = 300
-_PIXEL_SIGMA = 0.7  # of a sighting, pixels
+PIXEL_SIGMA = 0.7  # of a coordinate of a sighting, pixels
 _CONFIDENCE = 0.999
 
 
@@ -191,7 +191,7 @@ def _whitened(
         return residual, J, X
     line = (J[3:] * (spread @ T_camera_world[:3, :3].T).T[:, None]).sum(axis=0)
     square = np.maximum((line**2).sum(axis=0), 1e-9)
-    taken = (1.0 - _PIXEL_SIGMA / np.sqrt(_PIXEL_SIGMA**2 + square)) / square
+    taken = (1.0 - PIXEL_SIGMA / np.sqrt(PIXEL_SIGMA**2 + square)) / square
     residual, J = (of - (taken * (of * line).sum(axis=-2))[..., None, :] * line for of in (residual, J))
     return residual, J, X
 

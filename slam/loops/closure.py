@@ -74,13 +74,8 @@ def close_loops(
 ) -> LoopClosures:
     """Find the loops of a drive, once after its last frame.
 
-    Args:
-        views: in time order, their points in the unit of the trajectory.
-        T_world_camera: odometry ``(N, 4, 4)``.
-        intrinsics: of the images that the views were taken from.
-        config: thresholds.
-        is_metric: whether lengths are metres.
-        seed: of all RANSAC draws.
+    The ``views`` are in time order, their points in the unit of the odometry ``T_world_camera`` ``(N, 4, 4)``, which
+    ``is_metric`` or not.
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")

@@ -48,10 +48,7 @@ class Track:
 def agreeing(loops: Sequence[Loop], track: Track, thresholds: LoopThresholds) -> tuple[list[Loop], list[RejectedLoop]]:
     """Split verified loops into consistent ones, and ones without support or in conflict with others.
 
-    Args:
-        loops: verified, in the unit of the map of their earlier end.
-        track: the odometry.
-        thresholds: of nearness and of agreement.
+    They are in the unit of the map of their earlier end.
     """
     possible: list[Loop] = []
     kept: list[Loop] = []

@@ -36,12 +36,9 @@ class Candidate(NamedTuple):
 
 
 def find_candidates(views: Sequence[View], apart: Apart, thresholds: LoopThresholds) -> list[Candidate]:
-    """For each view the most similar earlier views, the best first.
+    """For each view, in time order, the most similar earlier views, the best first.
 
-    Args:
-        views: in time order.
-        apart: of some views ``(B,)``, by their rows, and all views: whether they may make a loop ``(B, V)``.
-        thresholds: how many candidates, how similar, and how far from each other.
+    ``apart`` says of some views ``(B,)``, by their rows, and of all views whether they may make a loop ``(B, V)``.
     """
     if len(views) < 2 or not any(map(len, views)):
         return []

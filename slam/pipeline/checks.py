@@ -6,11 +6,10 @@ import logging
 
 from slam.config.sections import SlamConfig
 from slam.frames import Sequence, runs
-from slam.frontend.drive import DOUBLED, Drive
+from slam.frontend.drive import DOUBLED, Drive, named
 from slam.frontend.image_gate import ImageGate
 from slam.frontend.lidar_odometry import has_scans
 from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
-from slam.frontend.segments import named
 from slam.runtime.errors import SlamError
 from slam.sequences.recording import GrowingSequence
 

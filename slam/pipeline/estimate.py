@@ -11,7 +11,6 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics, RelativePose, View
 from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.visual.depth_error import DepthError
@@ -21,7 +20,7 @@ from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
 from slam.mapping.map import TsdfMap
 from slam.pipeline.positioning import Location
-from slam.runtime.attempt import Failed
+from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch
 
 
@@ -59,7 +58,7 @@ class Estimate:
     network: Trajectory
     odometry: Trajectory
     optimised: Trajectory
-    lidar: LidarPath | MeasurementFailure | None
+    lidar: LidarPath | Failed | None
     reference: Trajectory | None
     drive: Drive
     depth_error: DepthError
@@ -68,9 +67,9 @@ class Estimate:
     views: list[View]
     loops: LoopClosures
     graph: PoseGraph | Failed
-    location: Location | MeasurementFailure | None
+    location: Location | Failed | None
     stopwatch: Stopwatch
-    confidence: float | MeasurementFailure
+    confidence: float | Failed
     support: FloatArray | None
     agreements: Sequence[Agreement] = ()
     map: TsdfMap | None = None

@@ -37,15 +37,8 @@ def fuse(
     """Learned depth at the optimised poses, refined and fused into one surface.
 
     A camera that is carried turns on the spot, where nothing measures learned depth. The error of that over
-    distance is known by steps, which measure only the first frames there, and is not taken out.
-
-    Args:
-        estimate: with keyframes.
-        intrinsics: of the sequence's images.
-        config: of all parts.
-        decide: between learned and measured depth; None where it is not refined.
-        compare: called with the depth of each keyframe that is far enough from the one before.
-        progress: called with the stage, done and total.
+    distance is known by steps, which measure only the first frames there, and is not taken out. ``decide`` is between
+    learned and measured depth, None where it is not refined; ``compare`` is called with each keyframe's depth.
     """
     drive, scales, T_world_camera = estimate.drive, estimate.scale.per_frame, estimate.optimised.T_world_camera
     height, width = drive.keyframes[0].depth_unscaled.shape
@@ -95,14 +88,8 @@ def keyframe_depths(
 ) -> Callable[[int], KeyframeDepth]:
     """The depth of the n-th keyframe of a drive in the unit of the trajectory, as a function of n.
 
-    Args:
-        drive: with at least one keyframe.
-        scale_per_frame: factor ``(N,)`` on unscaled depth.
-        T_world_camera: optimised poses of all frames ``(N, 4, 4)``.
-        error: of learned depth on this drive, taken out before depth is refined or fused.
-        intrinsics: of the keyframes.
-        decide: between learned and measured depth; None where it is not refined.
-        guess_sigma: relative sigma of depth that was to be refined and has no neighbours; None where unknown.
+    The ``error`` of learned depth is taken out first; ``scale_per_frame`` ``(N,)`` and ``T_world_camera`` ``(N, 4, 4)``
+    are of all frames. ``guess_sigma`` is that of depth that was to be refined and has no neighbours, None for none.
     """
     keyframes, refiner = drive.keyframes, None
     if decide is not None:

@@ -12,8 +12,7 @@ import numpy as np
 from erfsfm.common.threads import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
-from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
+from slam.frontend.drive import LAST_STEPS, Drive
 from slam.frontend.keyframes.local_map import LocalMap, MapSegment
 from slam.frontend.keyframes.odometry import MAX_CORNERS, KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
@@ -24,10 +23,10 @@ from slam.geometry.se3 import FloatArray, invert
 from slam.loops.descriptors import describe
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
+from slam.runtime.errors import Failed
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
-_LAST = 4  # number of the last steps and unusable frames that are checked
 _CLEAR_STEPS, _MOST_STEPS = 10, 30  # triangulated steps after which auto decides, if it is clear, or however that is
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
 _CLEAR_SCATTER_DEG = 5.0  # of a camera that is carried: a vehicle's first steps scatter by 2 degrees
@@ -141,9 +140,8 @@ class KeyframeTracking:
         """
         if self._measuring is None:
             return False
-        by_steps = {motion.ends[1] for motion in drive.motions[-_LAST:]}
-        is_doubtful = index in by_steps or not {index - 1, index}.isdisjoint(list(drive.unusable)[-_LAST:])
-        return not is_doubtful and self._measuring.locates(index - 1, index)
+        is_usable = {index - 1, index}.isdisjoint(list(drive.unusable)[-LAST_STEPS:])
+        return is_usable and drive.last_step(index) is None and self._measuring.locates(index - 1, index)
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
@@ -159,13 +157,13 @@ class KeyframeTracking:
         T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
         return before, T_before_frame
 
-    def maps(self, drive: Drive) -> tuple[MapSegment, ...]:
+    def maps(self, drive: Drive) -> list[MapSegment]:
         """All parts of maps so far, each in one unit; none of a vehicle, nor before the choice."""
         self.choose(drive)
         if self._measuring is None:
-            return ()
+            return []
         maps = [each.copy() for each in self._measuring.segments if each.started]
-        return tuple(part for each in maps for part in parts_of(each, self._intrinsics))
+        return [part for each in maps for part in parts_of(each, self._intrinsics)]
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:
@@ -190,6 +188,6 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
     return is_fast and scatter_deg < _VEHICLE_SCATTER_DEG
 
 
-def height_of(road: GroundPlane | MeasurementFailure) -> float | None:
+def height_of(road: GroundPlane | Failed) -> float | None:
     """The camera's height over the ground plane of a frame, unscaled; None without one."""
     return road.height_unscaled if isinstance(road, GroundPlane) else None

@@ -10,6 +10,7 @@ import numpy as np
 
 from slam.config.sections import SlamConfig
 from slam.frontend.agreement import frame_support
+from slam.frontend.drive import LAST_STEPS
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.scale.metric_scale import Scale, find_scale
@@ -18,7 +19,6 @@ from slam.geometry.se3 import FloatArray, compose, invert
 from slam.pipeline.observer import Observer
 
 _WINDOW, _UPDATE = 100, 10  # frames whose poses are solved again, and between two solutions
-_LAST_STEPS = 4  # looked through for that to a frame
 State = Literal["starting", "tracking", "bridged", "relocalised"]
 
 
@@ -46,13 +46,7 @@ class LivePoses:
     """
 
     def __init__(self, sources: int, camera_height_m: float | None, config: SlamConfig) -> None:
-        """Prepare for the first frame.
-
-        Args:
-            sources: of a snippet.
-            camera_height_m: above the road; None where unknown.
-            config: of all parts.
-        """
+        """Prepare for the first frame, by the ``sources`` of a snippet and the camera's height, None where unknown."""
         self._sources, self._camera_height_m = sources, camera_height_m
         self._mode = resolve_mode(config.scale, camera_height_m)
         self.unit_name: str | None = None  # of all lengths, None while unknown
@@ -84,7 +78,7 @@ class LivePoses:
         if drive.snippets and (self._unit is None or count // _UPDATE > first // _UPDATE):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        support = frame_support(frames, drive.motions[-_LAST_STEPS * len(frames) :]).tolist()
+        support = frame_support(frames, drive.motions[-LAST_STEPS * len(frames) :]).tolist()
         return [
             LivePose(k, pose.copy(), self._state(k in drive.unusable), unit, None if k in unasked else share)
             for k, pose, share in zip(frames, self._T_world_camera[first:], support)
@@ -109,14 +103,12 @@ class LivePoses:
         if not index:
             self._T_world_camera.append(np.eye(4))
             return False
-        before, by_keyframes = index - 1, observer.keyframe_step(index)
-        motions = observer.drive.motions[-_LAST_STEPS:]
-        motion = next((m for m in reversed(motions) if m.ends == (before, index)), None)
+        before, by_keyframes, motion = index - 1, observer.keyframes.step(index), observer.drive.last_step(index)
         T_before_frame = self._T_previous_newest
         if by_keyframes is not None:
             before, T_before_frame = by_keyframes
             self._settled = index
-        elif motion is not None:
+        elif motion is not None and motion.ends[0] == before:
             T_before_frame = motion.relative_pose.T_from_to.copy()
         if T_before_frame is not self._T_previous_newest:
             T_before_frame[:3, 3] *= self.unit
@@ -130,7 +122,7 @@ class LivePoses:
         window = observer.drive.since(first)
         if not window.snippets:
             return
-        by_keyframes = observer.keyframe_step(count - 1) is not None
+        by_keyframes = observer.keyframes.step(count - 1) is not None
         # keyframes know all lengths but their unit, which learned depth of the ground gives
         roads_alone = replace(window, motions=[], road_steps={})
         window = roads_alone if by_keyframes else complete_drive(window, self._sources)

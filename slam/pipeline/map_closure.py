@@ -58,11 +58,7 @@ class MapClosure:
 def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
     """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
 
-    Args:
-        maps: of one drive, in time order, started; they stay as they are.
-        poses: by these maps, which remain where no loop is found.
-        intrinsics: of all images.
-        seed: of RANSAC.
+    The ``maps`` of one drive, in time order, stay as they are, and so do their ``poses`` where no loop is found.
     """
     rows = _Rows(maps, poses)
     apart = rows.apart()
@@ -126,7 +122,7 @@ class _Rows:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
         views = []
         for segment in self.segments:
-            settled = segment.map.parallax().settled[:, None]
+            settled = segment.map.parallax(segment.map.keyframes).settled[:, None]
             views += views_of(segment.map.keyframes, np.where(settled, segment.map.points, np.nan))
         return views
 

@@ -15,11 +15,9 @@ import numpy as np
 
 from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, TrackingEvent, resized_mask
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, resized_mask
 from slam.frontend.drive import Drive, Keyframe
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.tracking import ROTATION_BASELINE
@@ -27,10 +25,10 @@ from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.geometry.se3 import FloatArray, chain, is_se3
+from slam.geometry.se3 import chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking, height_of
-from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
+from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch, return_freed_memory
 
@@ -38,7 +36,6 @@ logger = logging.getLogger(__name__)
 
 _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
-_LAST_STEPS = 4
 _LAST_ROADS = 8  # looked back for the camera's height, frames
 
 
@@ -47,16 +44,12 @@ class Observations:
     """All measurements up to a frame, which stay while others follow.
 
     ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as the steps have them.
-    ``maps`` are those of keyframes, none of a drive that is measured by steps alone, and ``events`` what became of
-    them.
     """
 
     drive: Drive
     gate: ImageGate
     depth_error: DepthError
     focal_length: FocalLength
-    maps: tuple[MapSegment, ...]
-    events: list[TrackingEvent]
 
 
 @dataclass
@@ -91,7 +84,7 @@ class Observer:
     result is collected with the next frame, so results do not depend on the timing of threads.
 
     With ``depth.frame_stride`` above 1, depth is carried to the frames between by the measured motion, and snippets
-    touch. While keyframes alone measure the camera, depth is predicted for them alone.
+    touch. While ``keyframes`` alone measure the camera, depth is predicted for them alone.
     """
 
     def __init__(
@@ -103,21 +96,12 @@ class Observer:
         seed: int = 0,
         camera_height_m: float | None = None,
     ) -> None:
-        """Prepare for the first frame.
-
-        Args:
-            predictor: depth and snippet poses.
-            intrinsics: of all images.
-            config: of all parts.
-            stopwatch: measures the time of stages.
-            seed: of all RANSAC draws.
-            camera_height_m: above the road; None where unknown.
-        """
+        """Prepare for the first frame; ``seed`` is that of all RANSAC draws, ``camera_height_m`` None where unknown."""
         self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
         self.drive = Drive()  # the measurements so far
         self._gate = ImageGate()
         self._odometry = VisualOdometry(intrinsics, seed)
-        self._keyframes = KeyframeTracking(
+        self.keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
         )
         self._road = RoadHomography(intrinsics)
@@ -143,7 +127,7 @@ class Observer:
 
     def close(self) -> None:
         """End the threads; tasks that have not begun are dropped."""
-        self._keyframes.close()
+        self.keyframes.close()
         for executor in (self._networks, self._beside):
             executor.shutdown(wait=True, cancel_futures=True)
 
@@ -165,7 +149,7 @@ class Observer:
         self._unread = 0
         with self._stopwatch.stage("read"):
             verdict: Verdict = self._gate.check(frame) if self._config.gaps.enabled else "new"
-        if isinstance(verdict, MeasurementFailure):
+        if isinstance(verdict, Failed):
             self._leave_out(index, verdict.reason)
             return
         asked = self._ask_networks(frame)
@@ -174,7 +158,9 @@ class Observer:
         finally:
             self._pending = asked
             if verdict == "repeated":  # what is measured of the frame before does not know it
-                self.drive.repeat(index, self._gate.was_moving)
+                self.drive.repeated.append(index)
+                if self._gate.was_moving:
+                    self.drive.moving.append(index)
 
     def flush(self) -> None:
         """Finish every frame so far."""
@@ -185,21 +171,15 @@ class Observer:
     def observations(self) -> Observations:
         """All measurements so far; more frames may follow."""
         self.flush()
-        maps = self._keyframes.maps(self.drive)
-        events = list(self._keyframes.events)
-        odometry = self._odometry
-        return Observations(
-            self.drive.copy(), copy(self._gate), odometry.depth_error, odometry.focal_length, maps, events
-        )
+        drive, odometry = self.drive.copy(), self._odometry
+        drive.maps = self.keyframes.maps(drive)
+        drive.events = list(self.keyframes.events)
+        return Observations(drive, copy(self._gate), odometry.depth_error, odometry.focal_length)
 
     @property
     def frames(self) -> int:
         """Number of frames so far."""
         return len(self.drive) + (self._pending is not None)
-
-    def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:
-        """As `KeyframeTracking.step`, of a finished frame."""
-        return self._keyframes.step(index)
 
     def _is_gap(self, frames: int) -> bool:
         """Whether so many frames in a row may be without a measurement."""
@@ -210,7 +190,7 @@ class Observer:
             self._measure_pending()
         finally:  # the error is of the frame before
             self.drive.unusable[index] = reason
-            self.drive.roads.append(MeasurementFailure(reason))
+            self.drive.roads.append(Failed(reason))
             self._snippet_frames = ()
 
     def _ask_networks(self, frame: Frame) -> FrameInWork:
@@ -220,7 +200,7 @@ class Observer:
         is_first = len(self._snippet_frames) == sources  # since a gap
         self._snippet_frames = (*self._snippet_frames, frame)[-sources - 1 :]
         # what was measured two frames ago is finished, whatever else is
-        by_keyframes, step = self._keyframes.measures(drive, index - 2), self._last_step(index - 2)
+        by_keyframes, step = self.keyframes.measures(drive, index - 2), drive.last_step(index - 2)
         has_moved = step is not None and self._has_moved_on(step, index + 1 - self._depth_index)
         after_frozen = drive.repeated[-1:] == [index - 1]  # what it hid is not carried
         wants_depth = not by_keyframes and (step is None or has_moved or index % stride == 0 or after_frozen)
@@ -232,10 +212,6 @@ class Observer:
         if wants_snippet:
             asked.snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
         return asked
-
-    def _last_step(self, index: int) -> Motion | None:
-        """The step to one of the last frames, where image geometry measured it."""
-        return next((motion for motion in self.drive.motions[-_LAST_STEPS:] if motion.ends[1] == index), None)
 
     def _has_moved_on(self, step: Motion, frames: int) -> bool:
         """Whether so many more steps as this one leave what the last predicted depth shows."""
@@ -271,7 +247,7 @@ class Observer:
             reason = f"it could not be measured: {explained(error)}"
             self.drive.unusable[index] = reason
             if len(self.drive) == index:  # one entry in ``roads`` as all frames
-                self.drive.roads.append(MeasurementFailure(reason))
+                self.drive.roads.append(Failed(reason))
             self._failed += 1
             is_known = isinstance(error, OneLineError | OSError | MemoryError)
             if is_known or shows_traceback() or not self._is_gap(self._failed):
@@ -286,13 +262,13 @@ class Observer:
         previous, drive = self._recent[-1] if self._recent else None, self.drive
         self._finish_tasks("depth network")  # of a keyframe, whose points depend on it
         with self._stopwatch.stage("keyframes"):
-            self._keyframes.follow(current.frame)
+            self.keyframes.follow(current.frame)
         with self._stopwatch.stage("geometry"):
             step = self._step(previous, current)
             rotation = self._relative_rotation(current.frame)
         self._finish_tasks()
-        self._keyframes.choose(drive)
-        drive.roads.append(MeasurementFailure("its depth was not predicted"))
+        self.keyframes.choose(drive)
+        drive.roads.append(Failed("its depth was not predicted"))
         self._recent = (*self._recent, current)[-ROTATION_BASELINE:]
         if current.snippet is not None:
             self._tasks.append(Task("pose network", current.snippet, self._keep_snippet))
@@ -316,7 +292,7 @@ class Observer:
             depth = np.where(resized_mask(current.standing, *depth.shape[::-1]), np.float32(0), depth)
         with self._stopwatch.stage("road"):
             self.drive.roads[frame.index] = road = self._plane.fit(depth, error)
-        self._keyframes.learn(frame, depth)
+        self.keyframes.learn(frame, depth)
         current.depth, current.height = depth, height_of(road)
         views, loops = self.drive.views, self._config.loops
         if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
@@ -327,36 +303,30 @@ class Observer:
         self._keep_for_map(frame, depth)
 
     def _depth_of(self, recent: FrameInWork) -> DepthMap:
-        """Depth ``(H, W)`` of a recent frame: carried from the frame before where it was not predicted, else late."""
-        if recent.depth is None and not self._carry(recent):
-            recent.depth = self._predict(recent.frame).result()
-            recent.height = height_of(self._plane.fit(recent.depth, self._odometry.depth_error))
-        assert recent.depth is not None
-        return recent.depth
-
-    def _carry(self, recent: FrameInWork) -> bool:
-        """Give a frame the depth of the frame before, moved with the camera; whether that is known."""
-        step = self._last_step(recent.frame.index)
+        """Depth ``(H, W)`` of a recent frame: where it was not predicted that of the frame before, moved, else late."""
+        if recent.depth is not None:
+            return recent.depth
+        step = self.drive.last_step(recent.frame.index)
         before = next((r for r in self._recent if step is not None and r.frame.index == step.ends[0]), None)
-        if step is None or before is None or before.depth is None:
-            return False
-        depth = self._odometry.carried(before.depth, step)
-        if depth is None:
-            return False
-        self._keep_for_map(recent.frame, depth)
-        recent.depth, recent.height = depth, before.height
-        return True
+        if step is not None and before is not None and before.depth is not None:
+            recent.depth, recent.height = self._odometry.carried(before.depth, step), before.height
+        if recent.depth is not None:
+            self._keep_for_map(recent.frame, recent.depth)
+            return recent.depth
+        recent.depth = self._predict(recent.frame).result()
+        recent.height = height_of(self._plane.fit(recent.depth, self._odometry.depth_error))
+        return recent.depth
 
     def _step(self, previous: FrameInWork | None, current: FrameInWork) -> Motion | None:
         """The motion from the frame before; None where keyframes measure it, it failed or triangulated no point."""
-        wanted = self._config.visual_odometry.enabled and not self._keyframes.measures(self.drive, current.frame.index)
+        wanted = self._config.visual_odometry.enabled and not self.keyframes.measures(self.drive, current.frame.index)
         if previous is None or not wanted:
             return None
         depth = self._depth_of(previous)
         measured = self._odometry.measure(previous.frame, current.frame, depth, previous.height, current.standing)
         if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
-            measured = MeasurementFailure(_NO_POSE)
-        if isinstance(measured, MeasurementFailure):
+            measured = Failed(_NO_POSE)
+        if isinstance(measured, Failed):
             self.drive.failures.append((previous.frame.index, current.frame.index, measured.reason))
             logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.frame.index, measured.reason)
             return None
@@ -375,7 +345,7 @@ class Observer:
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
         return self._odometry.relative_rotation(first.frame, current, self._depth_of(first), T_first_current)
 
-    def _keep_road(self, ends: Ends, step: RoadStep | MeasurementFailure) -> None:
+    def _keep_road(self, ends: Ends, step: RoadStep | Failed) -> None:
         if isinstance(step, RoadStep):
             self.drive.road_steps[ends] = step
         else:

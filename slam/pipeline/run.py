@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cached_property, partial
+from threading import Event
 
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import calling_on_signals
@@ -19,7 +20,6 @@ from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
@@ -45,8 +45,7 @@ from slam.pipeline.fusion import fuse
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observations, Observer
 from slam.pipeline.positioning import Location, Positioning
-from slam.runtime.attempt import Failed, attempt
-from slam.runtime.errors import SequenceError, SlamError
+from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
@@ -86,22 +85,13 @@ class SlamPipeline:
         seed: int = 0,
         gps_track: GpsTrack | None = None,
     ) -> None:
-        """Prepare a run.
-
-        Args:
-            sequence: frames in time order.
-            predictor: depth and snippet poses.
-            config: of all parts.
-            progress: called with the stage, done and total.
-            seed: of all RANSAC draws.
-            gps_track: positions of the drive.
-        """
+        """Prepare a run; ``seed`` is that of all RANSAC draws, ``progress`` is called with stage, done and total."""
         self.sequence, self._predictor, self._config = sequence, predictor, config
         self._progress, self._seed, self._gps_track = progress, seed, gps_track
         self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
         self._positioning: Positioning | None = None  # the GPS track matched to the drive
         self._watch = Stopwatch()
-        self._is_interrupted = False
+        self._interrupted = Event()
 
     def run(
         self,
@@ -123,7 +113,7 @@ class SlamPipeline:
         self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        with calling_on_signals(interrupt or self._interrupt):
+        with calling_on_signals(interrupt or self._interrupted.set):
             observed = self._observe(recorder, frames)
         self._leave_out_unseen(observed)
         self._progress("loops and graph", 0, 1)
@@ -146,10 +136,12 @@ class SlamPipeline:
         Raises:
             SlamError: no snippet of usable frames, or a source of lengths that contradicts the images.
         """
-        if (reference := self._reference) is not None:
+        true_poses = self.sequence.reference
+        reference = None if true_poses is None else self._trajectory(true_poses)
+        if reference is not None:
             recorder.trajectory("reference", reference)
         with self._watch.stage("geometry"):
-            poses = keyframe_poses(observed.maps, self.sequence.intrinsics, self._seed)
+            poses = keyframe_poses(observed.drive.maps, self.sequence.intrinsics, self._seed)
         drive = self._completed(observed, MapClosure(poses))
         network = self._trajectory(chain_raw(drive.snippets, len(drive)))
         recorder.trajectory("network", network)
@@ -219,12 +211,9 @@ class SlamPipeline:
                 observer.add(index, frame)
                 recorder.frame(observer)
                 self._progress("frames", index + 1, total)
-                if self._is_interrupted:
+                if self._interrupted.is_set():
                     break
             return observer.observations()
-
-    def _interrupt(self) -> None:
-        self._is_interrupted = True
 
     def _leave_out_unseen(self, observed: Observations) -> None:
         """After an interrupted pass the sequence is what was seen."""
@@ -240,8 +229,7 @@ class SlamPipeline:
 
     def _completed(self, observed: Observations, closure: MapClosure) -> Drive:
         """The drive with its gaps interpolated and the poses of its maps."""
-        events = [*observed.events, *closure.joins]
-        return complete_drive(observed.drive, self._predictor.sources, observed.maps, closure.poses, events)
+        return complete_drive(observed.drive, self._predictor.sources, closure.poses, closure.joins)
 
     def _odometry(
         self, drive: Drive, scale: Scale, lidar_steps: Sequence[RelativePose], agreements: Sequence[Agreement]
@@ -258,7 +246,7 @@ class SlamPipeline:
             factors = with_lidar(factors, lidar_steps)
         return Odometry(drive, scale, factors, chain_odometry(factors, len(drive)), lidar_steps, agreements)
 
-    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
+    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | Failed:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
         sequence = self.sequence
         if self.mode == "reference" and sequence.reference is not None:
@@ -270,18 +258,18 @@ class SlamPipeline:
     def _closed(self, odometry: Odometry, observed: Observations) -> tuple[Odometry, LoopClosures]:
         """The loops of a drive, and its odometry, which that of closed maps replaces."""
         camera, config, seed = self.sequence.intrinsics, self._config.loops, self._seed
-        if not (observed.maps and config.enabled):
+        if not (observed.drive.maps and config.enabled):
             views, is_metric = odometry.views(), odometry.scale.is_metric
             return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
-        closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
+        closure = close_maps(observed.drive.maps, odometry.drive.map_poses, camera, seed)
         if closure.loops.accepted:
             drive = self._completed(observed, closure)
             odometry = self._odometry(drive, odometry.scale, odometry.lidar_steps, odometry.agreements)
         return odometry, closure.closures(odometry.scale)
 
     def _optimised(
-        self, odometry: Odometry, loops: LoopClosures, location: Location | MeasurementFailure | None
-    ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | MeasurementFailure | None]:
+        self, odometry: Odometry, loops: LoopClosures, location: Location | Failed | None
+    ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | Failed | None]:
         """The graph, its trajectory ``(N, 4, 4)``, the loops that agree with it, and where it lies on the earth."""
         graph, positioning = PoseGraph(), self._positioning
         T_odometry = odometry.T_world_camera
@@ -302,7 +290,7 @@ class SlamPipeline:
         return mapped
 
     def _compared(
-        self, drive: Drive, lidar: LidarPath | MeasurementFailure | None, observed: Observations
+        self, drive: Drive, lidar: LidarPath | Failed | None, observed: Observations
     ) -> tuple[Sequence[RelativePose], list[Agreement]]:
         """Steps by LiDAR unless the images contradict them, and LiDAR and depth from elsewhere beside the images.
 
@@ -322,7 +310,7 @@ class SlamPipeline:
 
     def _confidence(
         self, odometry: Odometry, observed: Observations
-    ) -> tuple[list[Agreement], FloatArray | None, float | MeasurementFailure]:
+    ) -> tuple[list[Agreement], FloatArray | None, float | Failed]:
         """Agreements of all sources and of the images, the support of each frame, and what follows from both."""
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
         if self._positioning is not None and self._positioning.agreement is not None:
@@ -344,11 +332,6 @@ class SlamPipeline:
     def _decide(self) -> Decide | None:
         """Between learned and measured depth of the map's keyframes."""
         return decision(self._config.depth) if self._config.mapping.enabled else None
-
-    @property
-    def _reference(self) -> Trajectory | None:
-        reference = self.sequence.reference
-        return None if reference is None else self._trajectory(reference)
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self.sequence.stamps, T_world_camera)

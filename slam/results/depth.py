@@ -12,8 +12,7 @@ from slam.geometry.se3 import FloatArray, apply
 from slam.mapping.filters import KeyframeDepth
 from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.metrics import DepthOfKeyframes
-from slam.runtime.attempt import Failed
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import Failed, SlamError
 
 logger = logging.getLogger(__name__)
 

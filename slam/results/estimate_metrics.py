@@ -19,7 +19,6 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence, runs
 from slam.frontend import gps
 from slam.frontend.drive import DOUBLED
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import FloatArray, umeyama
 from slam.loops.closure import MOST_REJECTED, LoopClosures
@@ -27,7 +26,7 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.results import metrics as records
 from slam.results.metrics import Metrics
-from slam.runtime.attempt import Failed
+from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch, peak_rss_mb
 
 _NO_TRUTH = Failed("the sequence has no true poses")
@@ -111,7 +110,7 @@ def _stretches(reasons: Mapping[int, str]) -> list[records.Stretch]:
 def _lidar_metrics(result: Estimate, sequence: Sequence) -> TrajectoryMetrics | Failed:
     """Errors of LiDAR odometry at its frames."""
     path, lidar = result.lidar, lidar_trajectory(result)
-    if isinstance(path, MeasurementFailure):
+    if isinstance(path, Failed):
         return path
     if path is None or lidar is None:
         return Failed("the sequence has no LiDAR scans")
@@ -130,7 +129,7 @@ def _network_snippets(result: Estimate) -> SnippetErrors | None:
 
 def _scale(result: Estimate) -> records.ScaleMetrics:
     scale, estimate = result.scale, result.scale.estimate
-    found = {"value": estimate} if isinstance(estimate, MeasurementFailure) else asdict(estimate)
+    found = {"value": estimate} if isinstance(estimate, Failed) else asdict(estimate)
     return records.ScaleMetrics.of(
         mode=scale.mode, unit=scale.unit, contradicted_steps=len(scale.contradicted), **found
     )
@@ -198,9 +197,7 @@ def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
         fixes=len(location.fixes.stamps),
         in_graph=in_graph,
         origin=records.Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
-        odometry=aligned
-        if isinstance(aligned, MeasurementFailure)
-        else _distances(location.fixes, aligned, result.odometry),
+        odometry=aligned if isinstance(aligned, Failed) else _distances(location.fixes, aligned, result.odometry),
         optimised=_distances(location.fixes, location.T_enu_world, result.optimised),
     )
 

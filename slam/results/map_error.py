@@ -16,8 +16,7 @@ from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.pipeline.estimate import Estimate
 from slam.results.metrics import MAP_ERRORS, MapMetrics
-from slam.runtime.attempt import Failed
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import Failed, SlamError
 
 logger = logging.getLogger(__name__)
 

@@ -1,11 +1,17 @@
-"""The errors a user can cause; the command line prints them as one line and exits with 1."""
+"""The errors a user can cause, which the command line prints as one line and exits with 1, and results that failed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TypeVar
 
-from erfsfm.common.errors import DataError, OneLineError
+from erfsfm.common.errors import DataError, OneLineError, explained, shows_traceback
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 class SlamError(OneLineError):
@@ -51,3 +57,25 @@ def sequence_errors() -> Iterator[None]:
         yield
     except DataError as error:
         raise SequenceError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Why a measurement or a stage has no result: a text for the log and the report."""
+
+    reason: str
+
+
+def attempt(stage: str, compute: Callable[[], T]) -> T | Failed:
+    """The result of a stage, or why there is none: an error costs the stage, with a warning that names its place.
+
+    A disk without room is for the user to mend, and ``ERFSFM_TRACEBACK=1`` asks for the traceback: both are raised.
+    """
+    try:
+        return compute()
+    except Exception as error:
+        if shows_traceback() or isinstance(error, OSError) or isinstance(error.__cause__, OSError):
+            raise
+        reason = f"{stage} failed: {explained(error)}"
+        logger.warning(f"the run goes on without: {reason}")  # each in words of its own, so that none is only counted
+        return Failed(reason)

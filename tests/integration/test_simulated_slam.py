@@ -20,12 +20,12 @@ from slam.evaluation.map import pose_similarity
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.frames import Frame
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import ESSENTIAL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline
+from slam.runtime.errors import Failed
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
@@ -85,7 +85,7 @@ def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Es
 @pytest.mark.slow
 def test_the_camera_height_gives_metres(round_trip: Estimate) -> None:
     estimate = round_trip.scale.estimate
-    assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, MeasurementFailure)
+    assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, Failed)
     assert estimate.value * FACTOR == pytest.approx(1.0, rel=0.03)
     assert estimate.frames_used > 200
     assert round_trip.optimised.length_m == pytest.approx(round_trip.reference.length_m, rel=0.03)

@@ -20,7 +20,7 @@ from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import from_rotation_vector, invert
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics, ScaleMetrics, SequenceMetrics
-from slam.runtime.attempt import Failed
+from slam.runtime.errors import Failed
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")

@@ -25,8 +25,7 @@ from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provena
 from slam.results.report.map_view import map_view
 from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
-from slam.runtime.attempt import Failed, attempt
-from slam.runtime.errors import EmptyMapError, SlamError
+from slam.runtime.errors import EmptyMapError, Failed, SlamError, attempt
 from slam.runtime.run_files import CONFIG, GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
 from slam.runtime.storage.files import from_anywhere
 

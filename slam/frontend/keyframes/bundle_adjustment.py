@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
-from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.depth_prior import HUBER
-from slam.geometry.resection import LEAST_DEPTH as _LEAST_DEPTH
-from slam.geometry.resection import pixel_jacobian
+from slam.geometry.resection import LEAST_DEPTH, PIXEL_SIGMA, pixel_jacobian
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, apply, compose, make
+from slam.geometry.se3 import FloatArray, apply, compose, from_rotation_vector
 
+_HUBER = 1.5  # sigmas beyond which residuals weigh less
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 # points whose sightings are eliminated together: they share few cameras
@@ -55,14 +53,6 @@ class Sightings:
 
 
 @dataclass(frozen=True)
-class Noise:
-    """Sigma of a tracked corner's coordinate, pixels; residuals beyond ``huber`` sigmas weigh less."""
-
-    pixel: float = 0.7
-    huber: float = HUBER
-
-
-@dataclass(frozen=True)
 class Adjusted:
     """Cameras ``T_camera_world`` ``(K, 4, 4)``, ``points`` ``(P, 3)`` in the world, ``residual_px`` ``(S,)``, the cost.
 
@@ -78,19 +68,18 @@ class Adjusted:
 class BundleAdjustment:
     """One problem: what is seen by whom, and which cameras are free."""
 
-    def __init__(self, sightings: Sightings, intrinsics: Intrinsics, free: NDArray[np.bool_], noise: Noise) -> None:
-        """Prepare to solve.
-
-        Args:
-            sightings: of all cameras.
-            intrinsics: of all cameras.
-            free: ``(K,)``, the cameras to adjust; the others stay.
-            noise: of the sightings.
-        """
-        self._seen = sightings
+    def __init__(
+        self,
+        sightings: Sightings,
+        intrinsics: Intrinsics,
+        free: NDArray[np.bool_],
+        pixel_sigma: float = PIXEL_SIGMA,
+        huber: float = _HUBER,
+    ) -> None:
+        """Prepare to adjust the cameras that are ``free`` ``(K,)``; residuals beyond ``huber`` sigmas weigh less."""
+        self._seen, self._pixel_sigma, self._huber = sightings, pixel_sigma, huber
         self._focal = np.array([intrinsics.fx, intrinsics.fy])
         self._rays = intrinsics.rays(sightings.pixels)[:, :2]
-        self._noise = noise
         self._log_depth = np.log(sightings.depth)
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
@@ -120,7 +109,10 @@ class BundleAdjustment:
             step = system.step(damping)
             before = cost
             if step is not None:
-                T_new, X_new = self._moved(T, X, *step)
+                by_camera, by_point = step
+                T_new, X_new = T.copy(), X.copy()
+                T_new[self._free] = compose(from_rotation_vector(by_camera[:, :3], by_camera[:, 3:]), T[self._free])
+                X_new[: self._points] += by_point
                 residuals_new = self.residuals(T_new, X_new)
                 cost_new = self._cost(residuals_new)
                 if cost_new <= cost:
@@ -132,15 +124,15 @@ class BundleAdjustment:
             damping *= 10.0
             if damping > _MOST_DAMPING:
                 break
-        pixel = np.linalg.norm(residuals[:, :2], axis=1) * self._noise.pixel
-        return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf), cost)
+        pixel = np.linalg.norm(residuals[:, :2], axis=1) * self._pixel_sigma
+        return Adjusted(T, X, np.where(self._in_cameras(T, X)[:, 2] > LEAST_DEPTH, pixel, np.inf), cost)
 
     def residuals(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
         """Of both pixel coordinates and of the logarithm of depth, over their sigmas ``(S, 3)``."""
         X = self._in_cameras(T_camera_world, points)
-        z = np.maximum(X[:, 2:], _LEAST_DEPTH)
+        z = np.maximum(X[:, 2:], LEAST_DEPTH)
         found = np.empty((len(X), 3))
-        found[:, :2] = (X[:, :2] / z - self._rays) * self._focal / self._noise.pixel
+        found[:, :2] = (X[:, :2] / z - self._rays) * self._focal / self._pixel_sigma
         found[:, 2] = self._relief(np.log(z[:, 0]) - self._log_depth)
         return found
 
@@ -155,7 +147,7 @@ class BundleAdjustment:
         rows = np.concatenate(self._learned_rows)
         image = np.repeat(np.arange(len(self._learned_rows)), [len(each) for each in self._learned_rows])
         own, sigma = logarithms[rows], self._depth_sigma[rows]
-        near, full = self._noise.huber * sigma, sigma**-2
+        near, full = self._huber * sigma, sigma**-2
         unit = np.array([median(logarithms[each]) for each in self._learned_rows])
         for _ in range(_ROUNDS):
             weight = full * np.minimum(1.0, near / np.maximum(np.abs(own - unit[image]), 1e-9))
@@ -167,8 +159,8 @@ class BundleAdjustment:
         """Derivatives of the residuals by their camera's perturbation ``(6, 3, S)`` and their point ``(3, 3, S)``."""
         X = self._in_cameras(T_camera_world, points)
         by_camera = np.zeros((6, 3, len(X)))
-        by_camera[:, :2] = pixel_jacobian(X, self._focal / self._noise.pixel)
-        scale = self._learned / (self._depth_sigma * np.maximum(X[:, 2], _LEAST_DEPTH))
+        by_camera[:, :2] = pixel_jacobian(X, self._focal / self._pixel_sigma)
+        scale = self._learned / (self._depth_sigma * np.maximum(X[:, 2], LEAST_DEPTH))
         by_camera[0, 2], by_camera[1, 2], by_camera[5, 2] = X[:, 1] * scale, -X[:, 0] * scale, scale
         by_point = np.empty((3, 3, len(X)))
         for T, rows in zip(T_camera_world, self._rows, strict=True):
@@ -181,12 +173,9 @@ class BundleAdjustment:
             X[rows] = apply(T, X[rows])
         return X
 
-    def _depths(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
-        return self._in_cameras(T_camera_world, points)[:, 2]
-
     def _cost(self, residuals: FloatArray) -> float:
         """Huber's."""
-        length, k = self._lengths(residuals), self._noise.huber
+        length, k = self._lengths(residuals), self._huber
         return float(np.where(length < k, 0.5 * length**2, k * (length - 0.5 * k)).sum())
 
     def _lengths(self, residuals: FloatArray) -> FloatArray:
@@ -196,18 +185,8 @@ class BundleAdjustment:
     def weights(self, residuals: FloatArray) -> FloatArray:
         """Square roots of Huber's weights ``(S, 3)``."""
         length = self._lengths(residuals)
-        root = np.sqrt(np.minimum(self._noise.huber / np.maximum(length, 1e-12), 1.0))
+        root = np.sqrt(np.minimum(self._huber / np.maximum(length, 1e-12), 1.0))
         return np.asarray(root[:, [0, 0, 1]])
-
-    def _moved(
-        self, T_camera_world: FloatArray, points: FloatArray, by_camera: FloatArray, by_point: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        T = T_camera_world.copy()
-        moved = make(Rotation.from_rotvec(by_camera[:, :3]).as_matrix(), by_camera[:, 3:])
-        T[self._free] = compose(moved, T[self._free])
-        X = points.copy()
-        X[: self._points] += by_point
-        return T, X
 
     def _eliminated_together(self) -> list[_Block]:
         """Points in the order of the first camera that sees them, in blocks that share few cameras."""
@@ -252,7 +231,7 @@ class _Block:
 class _System:
     """Normal equations: cameras ``U`` ``(F, 6, 6)``, points ``V`` ``(P, 3, 3)``, their coupling, right sides."""
 
-    blocks: list[_Block]
+    blocks: Sequence[_Block]
     U: FloatArray
     V: FloatArray
     W: FloatArray  # (6, 3, S)
@@ -283,20 +262,8 @@ class _System:
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
         """Steps of cameras ``(F, 6)`` and points ``(P, 3)``; None where the system is singular."""
         V_inverse = np.asarray(np.linalg.inv(_damped(self.V, damping)), np.float64)
-        parts, side, blocks = self._reduced(damping, V_inverse)
-        by_camera = solve_sum(parts, side)
-        if by_camera is None:
-            return None
-        by_point = self.point_side.copy()
-        for block, W in blocks:
-            by_point[block.points] -= (by_camera[block.cameras].ravel() @ W).reshape(-1, 3)
-        return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
-
-    def _reduced(
-        self, damping: float, V_inverse: FloatArray
-    ) -> tuple[list[Part], FloatArray, list[tuple[_Block, FloatArray]]]:
-        """The cameras' system without the points, as a sum of parts, and the coupling of each block."""
-        side = self.camera_side.copy()
+        # the cameras' system without the points, as a sum of parts
+        side, by_point = self.camera_side.copy(), self.point_side.copy()
         parts = [(np.array([k]), own) for k, own in enumerate(_damped(self.U, damping))]
         coupled = []
         for block in self.blocks:
@@ -308,7 +275,12 @@ class _System:
             parts.append((block.cameras, -(WV @ W.T)))
             side[block.cameras] -= (WV @ self.point_side[block.points].ravel()).reshape(-1, 6)
             coupled.append((block, W))
-        return parts, side, coupled
+        by_camera = solve_sum(parts, side)
+        if by_camera is None:
+            return None
+        for block, W in coupled:
+            by_point[block.points] -= (by_camera[block.cameras].ravel() @ W).reshape(-1, 3)
+        return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
 
 
 def _damped(blocks: FloatArray, damping: float) -> FloatArray:

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
-from slam.frontend.keyframes.depth_prior import DEPTH_SIGMA
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
+from slam.frontend.keyframes.local_map import DEPTH_SIGMA
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.epipolar import triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
 from slam.geometry.se3 import FloatArray, make
@@ -32,13 +32,7 @@ def first_motion(
 ) -> tuple[FloatArray, FloatArray]:
     """``T_now_before`` of two views, and the depth in the first one ``(M,)``, in the unit of a prior.
 
-    Args:
-        T_now_before: the first start.
-        pixels_before: of corners ``(M, 2)`` in the first view.
-        pixels: in the second.
-        depth: of the corners in the first view by the prior ``(M,)``.
-        intrinsics: of both.
-        seed: of RANSAC.
+    From corners at ``pixels_before`` and ``pixels`` ``(M, 2)`` with ``depth`` ``(M,)`` in the first view by the prior.
     """
     rays_before, rays = intrinsics.rays(pixels_before), intrinsics.rays(pixels)
     tolerance = _INLIER_PX / intrinsics.fx
@@ -61,7 +55,7 @@ def first_motion(
         np.concatenate([depth, np.full(len(rows), np.nan)]),
         np.full(2 * len(rows), DEPTH_SIGMA),
     )
-    problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]), Noise())
+    problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]))
     solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_LIMITS) for T, z in starts]
     costs = np.array([adjusted.cost for adjusted in solved])
     best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]

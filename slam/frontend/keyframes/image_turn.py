@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Grey, Intrinsics
+from slam.frontend.image_gate import slopes_of
 from slam.frontend.tracking import Pixels
 from slam.geometry.epipolar import rotation_between
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix
@@ -90,8 +91,7 @@ class _Alignment:
         u, v = (x - self._centre[0]) / self._focal[0], (y - self._centre[1]) / self._focal[1]
         self._rays = np.stack([u, v, np.ones_like(u)]).astype(np.float32)
         self._first = first.ravel()
-        gradient = [cv2.Sobel(first, cv2.CV_32F, *axis, scale=0.125).ravel() for axis in ((1, 0), (0, 1))]
-        by_u, by_v = self._focal[0] * gradient[0], self._focal[1] * gradient[1]
+        by_u, by_v = (focal * slope.ravel() for focal, slope in zip(self._focal, slopes_of(first), strict=True))
         # of the first image, by a small turn of its rays
         self._jacobian = np.stack(
             [-by_u * u * v - by_v * (1 + v * v), by_u * (1 + u * u) + by_v * u * v, by_v * u - by_u * v]
@@ -143,10 +143,7 @@ def turned(pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: In
 def in_middle_row(pixels: _Places, turn: FloatArray, intrinsics: Intrinsics) -> _Places:
     """Pixels ``(M, 2)`` of an image as the camera sees them when the middle row is read.
 
-    Args:
-        pixels: as the image has them.
-        turn: of the camera, rotation vector a second ``(3,)``, as of ``R_current_previous``.
-        intrinsics: of the image.
+    The camera's ``turn`` ``(3,)`` is a rotation vector a second, as of ``R_current_previous``.
     """
     if not intrinsics.readout_s or not len(pixels):
         return pixels
@@ -158,14 +155,9 @@ def in_middle_row(pixels: _Places, turn: FloatArray, intrinsics: Intrinsics) -> 
 def measured_turn(
     before: Pixels | FloatArray, pixels: Pixels, seconds: float, turn: FloatArray, intrinsics: Intrinsics
 ) -> FloatArray:
-    """The turn a second ``(3,)`` between two images; zero with few corners.
+    """The turn a second ``(3,)`` between two images, started from the one before; zero with few corners.
 
-    Args:
-        before: corners in the image before ``(M, 2)``, when its middle row was read.
-        pixels: the same corners in this image ``(M, 2)``, as it has them.
-        seconds: between the images.
-        turn: the one before, to start from.
-        intrinsics: of both images.
+    They were ``before`` ``(M, 2)`` when the middle row was read, and are at ``pixels`` ``(M, 2)`` of the image.
     """
     if len(pixels) < _LEAST_CORNERS or seconds <= 0:
         return np.zeros(3)

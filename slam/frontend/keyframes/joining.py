@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,22 +43,14 @@ def join(
     Returns:
         The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
     """
-    united = _united([moved(*part) for part in _parts(segments, T_world_camera, scales)])
+    ends = np.cumsum([len(segment.map.keyframes) for segment in segments])[:-1]
+    parts = zip(segments, np.split(T_world_camera, ends), np.split(scales, ends), strict=True)
+    united = _united([moved(*part) for part in parts])
     keyframes = united.map.keyframes
     tracks = _merged_tracks(keyframes, len(united.map.points), shared)
     joined = _renumbered(united, tracks)
     _adjust_all(joined.map, intrinsics)
     return joined, [_kept_ratio(*pair, keyframes, joined.map.keyframes, tracks) for pair in shared]
-
-
-def _parts(
-    segments: Sequence[MapSegment], T_world_camera: FloatArray, scales: FloatArray
-) -> list[tuple[MapSegment, FloatArray, FloatArray]]:
-    ends = np.cumsum([0, *(len(segment.map.keyframes) for segment in segments)])
-    return [
-        (segment, T_world_camera[first:last], scales[first:last])
-        for segment, (first, last) in zip(segments, pairwise(ends), strict=True)
-    ]
 
 
 def moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -> MapSegment:
@@ -78,18 +69,13 @@ def moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -
     frames = []
     for frame in segment.frames:
         row = max(int(np.searchsorted(indices, frame.index, side="right")) - 1, 0)
-        frames.append(_followed(frame, before.keyframes[row].T_camera_world, T_camera_world[row], scales[row]))
+        T_followed = None
+        if frame.T_camera_world is not None:
+            T_frame_keyframe = frame.T_camera_world @ invert(before.keyframes[row].T_camera_world)
+            T_frame_keyframe[:3, 3] *= scales[row]
+            T_followed = T_frame_keyframe @ T_camera_world[row]
+        frames.append(replace(frame, T_camera_world=T_followed))
     return MapSegment(LocalMap(keyframes, points), frames, segment.started, segment.turns)
-
-
-def _followed(
-    frame: TrackedFrame, T_keyframe_before: FloatArray, T_keyframe_world: FloatArray, scale: float
-) -> TrackedFrame:
-    if frame.T_camera_world is None:
-        return frame
-    T_frame_keyframe = frame.T_camera_world @ invert(T_keyframe_before)
-    T_frame_keyframe[:3, 3] *= scale
-    return replace(frame, T_camera_world=T_frame_keyframe @ T_keyframe_world)
 
 
 def _united(segments: Sequence[MapSegment]) -> MapSegment:

@@ -1,4 +1,9 @@
-"""Keyframes and the points they see: points from learned depth, found again, adjusted with the last keyframes."""
+"""Keyframes and the points they see: points from learned depth, found again, adjusted with the last keyframes.
+
+Learned depth says what depths of an image are to each other, nothing about the unit of the map: depths of one image fit
+each other much better than those of two images, for they share an unknown unit. What remains is still no independent
+error of each point, so that it weighs less where rays know a depth as well.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, nearest_depth
-from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
-from slam.frontend.keyframes.depth_prior import Parallax, unit_for_new
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, track
+from slam.geometry.resection import PIXEL_SIGMA
+from slam.geometry.robust import weighted_median
 from slam.geometry.se3 import FloatArray, apply, invert
 
 TrackIds = NDArray[np.int64]
@@ -39,6 +45,55 @@ _LIMITS, _YOUNG_LIMITS = (6, 3e-3), (12, 1e-3)
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
+DEPTH_SIGMA = 0.3  # of the logarithm of learned depth
+_SETTLED = np.deg2rad(1.0)  # angle between rays of a point with parallax
+_LEAST_RATIOS = 20  # of known points to learned depth, by which new ones get their unit
+
+
+class Parallax:
+    """Of ``N`` points: the first ``centre`` that saw each ``(N, 3)``, NaN for none, and ``angle`` ``(N,)``.
+
+    The angle is the widest between that first ray of a point and others, radians.
+    """
+
+    def __init__(self, points: FloatArray) -> None:
+        """Before any camera sees the points ``(N, 3)``, which are in the world."""
+        self._points = points
+        self._cosine = np.ones(len(points))
+        self.centre = np.full_like(points, np.nan)
+
+    def see(self, T_camera_world: FloatArray, rows: NDArray[np.int64]) -> None:
+        """The next camera in time order sees the points of these rows."""
+        camera, points = invert(T_camera_world)[:3, 3], self._points[rows]
+        fresh = rows[np.isnan(self.centre[rows, 0])]
+        self.centre[fresh] = camera
+        first, now = points - self.centre[rows], points - camera
+        lengths = np.sqrt((first**2).sum(axis=1) * (now**2).sum(axis=1))
+        cosine = (first * now).sum(axis=1) / np.maximum(lengths, 1e-12)
+        self._cosine[rows] = np.minimum(self._cosine[rows], cosine)
+
+    @property
+    def angle(self) -> FloatArray:
+        """Radians ``(N,)``."""
+        return np.asarray(np.arccos(np.clip(self._cosine, -1.0, 1.0)))
+
+    @property
+    def settled(self) -> NDArray[np.bool_]:
+        """Which points have parallax ``(N,)``."""
+        return np.asarray(self._cosine < np.cos(_SETTLED))
+
+    def by_rays(self, pixel_angle: float) -> FloatArray:
+        """Sigmas of the logarithm of depth ``(N,)`` by rays that are known to ``pixel_angle`` radians."""
+        return np.asarray(pixel_angle / np.maximum(self.angle, 1e-9))
+
+    def prior_sigma(self, pixel_angle: float) -> FloatArray:
+        """The same by learned depth ``(N,)``: errors that points share do not pull at what rays know."""
+        return np.asarray(DEPTH_SIGMA * (1.0 + (DEPTH_SIGMA / self.by_rays(pixel_angle)) ** 2))
+
+    def spread(self, pixel_angle: float) -> FloatArray:
+        """One sigma of each point along its first ray ``(N, 3)``, if rays are known to ``pixel_angle`` radians."""
+        sigma = np.minimum(self.by_rays(pixel_angle), DEPTH_SIGMA)
+        return np.asarray(sigma[:, None] * (self._points - self.centre))
 
 
 @dataclass(frozen=True)
@@ -106,15 +161,8 @@ class LocalMap:
         if len(self.keyframes) > _IMAGES_KEPT:
             self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
 
-    def forget_images(self) -> None:
-        """Free the images of a map to which no keyframe will be added."""
-        self.keyframes = [replace(keyframe, grey=None) for keyframe in self.keyframes]
-
-    def parallax(self, last: int | None = None) -> Parallax:
-        """Of all points, between the last keyframes that see them, or between all."""
-        return self._parallax(self.keyframes if last is None else self.keyframes[-last:])
-
-    def _parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
+    def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
+        """Of all points, between those of the keyframes that see them."""
         parallax = Parallax(self.points)
         for keyframe in keyframes:
             parallax.see(keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)])
@@ -126,14 +174,15 @@ class LocalMap:
         tracks, learned = newest.track_ids, newest.learned_depth
         ratios = self.ratios(newest)
         both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
-        by_rays = self.parallax(_LOOKED_BACK).by_rays(Noise().pixel / intrinsics.fx)
-        unit = unit_for_new(ratios[both], by_rays[tracks[both]])
+        by_rays = self.parallax(self.keyframes[-_LOOKED_BACK:]).by_rays(PIXEL_SIGMA / intrinsics.fx)
+        weights = 1.0 / (DEPTH_SIGMA**2 + by_rays[tracks[both]] ** 2)
+        unit = weighted_median(ratios[both], weights) if both.sum() >= _LEAST_RATIOS else 1.0
         rays = intrinsics.rays(newest.pixels[new]) * (unit * learned[new, None])
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
 
     def spread(self, intrinsics: Intrinsics) -> FloatArray:
         """One sigma of the newest keyframe's points ``(M, 3)``, along the ray on which each was seen first."""
-        spread = self.parallax(_LOOKED_BACK).spread(Noise().pixel / intrinsics.fx)
+        spread = self.parallax(self.keyframes[-_LOOKED_BACK:]).spread(PIXEL_SIGMA / intrinsics.fx)
         return np.nan_to_num(spread[self.keyframes[-1].track_ids])
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
@@ -146,7 +195,10 @@ class LocalMap:
         seen = np.zeros(len(self.points), np.bool_)
         seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
         seen &= np.isfinite(self.points[:, 0])
-        fixed = self._sharing(seen, first)
+        # older keyframes that share most of these points
+        shared = [(int(seen[keyframe.track_ids].sum()), k) for k, keyframe in enumerate(self.keyframes[:first])]
+        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
+        fixed = sorted(k for _, k in best)
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
@@ -170,7 +222,7 @@ class LocalMap:
         """
         free = np.arange(len(chosen)) >= fixed
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
-        problem = BundleAdjustment(sightings, intrinsics, free, Noise())
+        problem = BundleAdjustment(sightings, intrinsics, free)
         solved = problem.solve(poses, self.points[track_ids], *limits)
         self.points[track_ids] = solved.points
         bad = solved.residual_px > outlier_px
@@ -180,12 +232,6 @@ class LocalMap:
         dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
         self.points[dead] = np.nan
         return gone, dead
-
-    def _sharing(self, seen: NDArray[np.bool_], first: int) -> list[int]:
-        """The keyframes before ``first`` that share most of the points seen."""
-        shared = [(int(seen[keyframe.track_ids].sum()), k) for k, keyframe in enumerate(self.keyframes[:first])]
-        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
-        return sorted(k for _, k in best)
 
     def sightings(
         self, chosen: Sequence[int], seen: NDArray[np.bool_], intrinsics: Intrinsics
@@ -201,7 +247,7 @@ class LocalMap:
         track = joined(keyframe.track_ids for keyframe in keyframes)
         pixel = joined(keyframe.pixels for keyframe in keyframes)
         depth = joined(np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan) for keyframe in keyframes)
-        sigma = self._parallax(keyframes).prior_sigma(Noise().pixel / intrinsics.fx)[track]
+        sigma = self.parallax(keyframes).prior_sigma(PIXEL_SIGMA / intrinsics.fx)[track]
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
         return Sightings(camera[twice], row_of, pixel[twice], depth[twice], sigma[twice]), points

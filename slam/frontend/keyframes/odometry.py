@@ -8,7 +8,8 @@ not drift, so each corner is compared with its image in the keyframe, not with t
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +52,10 @@ _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.f
 
 
 class KeyframeOdometry:
-    """Poses of the frames of one sequence in the unit of each segment's map."""
+    """Poses of the frames of one sequence in the unit of each segment's map.
+
+    ``segments`` are the maps so far, of which the last one grows with the frames; ``events`` tell what became of them.
+    """
 
     def __init__(
         self,
@@ -66,30 +70,20 @@ class KeyframeOdometry:
         self._intrinsics = intrinsics
         self._seed = seed
         self._on_keyframe = on_keyframe
-        self._segments: list[MapSegment] = []  # of the drive so far; what follows continues the last one
+        self.segments: list[MapSegment] = []
         self._places: Pixels = np.zeros((0, 2), np.float32)  # of the keyframe's corners
         self._slipped: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._T_camera_world = self._T_last_step = np.eye(4)
         self._lost, self._stamp = 0, 0.0
         self._turn_rate = np.zeros(3)  # a second, where the shutter rolls
         self._small: SmallImage = np.zeros((0, 0), np.float32)
-        self._events: list[TrackingEvent] = []
+        self.events: list[TrackingEvent] = []
         self._spread: FloatArray | None = None  # of the points of the last keyframe, once they are looked for
-
-    @property
-    def segments(self) -> Sequence[MapSegment]:
-        """The maps so far, which grow with the frames."""
-        return self._segments
-
-    @property
-    def events(self) -> Sequence[TrackingEvent]:
-        """What became of the maps so far."""
-        return self._events
 
     def lost_map(self) -> MapSegment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""
-        started = [segment for segment in self._segments if segment.started]
-        is_lost = bool(started) and (self._lost > 0 or not self._segments[-1].started)
+        started = [segment for segment in self.segments if segment.started]
+        is_lost = bool(started) and (self._lost > 0 or not self.segments[-1].started)
         return started[-1] if is_lost else None
 
     def relocalise(
@@ -102,20 +96,16 @@ class KeyframeOdometry:
     ) -> None:
         """Go on in the lost map with the frame that was added last, which becomes a keyframe.
 
-        Args:
-            frame: at the size of the intrinsics.
-            T_camera_world: in the lost map.
-            track_ids: of its points ``(M,)``, each once.
-            pixels: where the frame sees them ``(M, 2)``.
-            place: the frame of the keyframe with most of these points.
+        It sees points of the map, each once, by ``track_ids`` ``(M,)`` at ``pixels`` ``(M, 2)``; ``place`` is the frame
+        of the keyframe with most of these.
         """
-        if self._segments[-1].started:
-            self._note(self._segments[-1].frames[-self._lost].index, "lost")
-            self._segments[-1].frames.pop()
+        if self.segments[-1].started:
+            self._note(self.segments[-1].frames[-self._lost].index, "lost")
+            self.segments[-1].frames.pop()
         else:
-            self._segments.pop()
+            self.segments.pop()
         self._note(frame.index, "relocalised", place, len(track_ids))
-        segment = self._segments[-1]
+        segment = self.segments[-1]
         self._T_camera_world, self._T_last_step, self._lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
         pixels = in_middle_row(pixels, self._turn_rate, self._intrinsics)
@@ -132,11 +122,11 @@ class KeyframeOdometry:
         images = before, self._small, self._T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
         since, self._stamp = frame.stamp - self._stamp, frame.stamp
-        if not self._segments or not self._segments[-1].started:  # without learned depth there are no points
-            del self._segments[-1:]
+        if not self.segments or not self.segments[-1].started:  # without learned depth there are no points
+            del self.segments[-1:]
             self._begin(frame)
             return
-        segment = self._segments[-1]
+        segment = self.segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
         self._measure_turn(segment, track_ids, pixels, since)
         if self._locate(segment, frame, track_ids, pixels):
@@ -155,7 +145,7 @@ class KeyframeOdometry:
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of the frame that was followed last, which gives points where it is a keyframe."""
-        segment = self._segments[-1]
+        segment = self.segments[-1]
         local = segment.map
         if local.keyframes[-1].index != frame.index:
             return
@@ -165,23 +155,23 @@ class KeyframeOdometry:
         points = int(local.known(local.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
-            for before in self._segments[:-1]:
-                before.map.forget_images()
+            for before in self.segments[:-1]:  # no keyframe will be added to them
+                before.map.keyframes = [replace(keyframe, grey=None) for keyframe in before.map.keyframes]
             self._note(frame.index, "map begun", support=points)
 
     def locates(self, first: int, last: int) -> bool:
         """Whether two of the last frames both have a pose in the newest map."""
-        frames = self._segments[-1].frames[-_LAST_FRAMES:] if self._segments else []
+        frames = self.segments[-1].frames[-_LAST_FRAMES:] if self.segments else []
         located = {frame.index for frame in frames if frame.T_camera_world is not None}
         return {first, last} <= located
 
     def _begin(self, frame: Frame) -> None:
         """A new map whose first keyframe is this frame."""
         if self._lost:
-            self._note(self._segments[-1].frames[-self._lost].index, "lost")
-        self._segments.append(MapSegment())
+            self._note(self.segments[-1].frames[-self._lost].index, "lost")
+        self.segments.append(MapSegment())
         self._T_camera_world, self._lost = np.eye(4), 0
-        self._add_keyframe(self._segments[-1], frame, *_NOTHING)
+        self._add_keyframe(self.segments[-1], frame, *_NOTHING)
 
     def _track(self, segment: MapSegment, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a turn."""
@@ -213,9 +203,12 @@ class KeyframeOdometry:
         self._slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
-        parallax_ratio = self._parallax_ratio(segment, track_ids, pixels)
-        if self._wants_keyframe(segment, track_ids, pixels, parallax_ratio):
-            if parallax_ratio > _YOUNG_PARALLAX_RATIO:
+        last, is_young = segment.map.keyframes[-1], len(segment.map.keyframes) < _YOUNG_KEYFRAMES
+        parallax, flow = self._moved_since(last, track_ids, pixels)
+        limit = _YOUNG_PARALLAX_RATIO if is_young else _PARALLAX_RATIO
+        are_few = len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS)
+        if are_few or parallax > limit or flow > _MOST_FLOW * limit:
+            if parallax > _YOUNG_PARALLAX_RATIO:
                 self._check_first_motion(segment, track_ids, pixels)
             self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(self._tracked(frame, track_ids, pixels))
@@ -241,7 +234,8 @@ class KeyframeOdometry:
         local, before = segment.map, segment.map.keyframes[-1]
         rows = np.searchsorted(before.track_ids, track_ids)
         known = local.known(track_ids)
-        if local.parallax(_LOOKED_BACK).settled[track_ids].sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
+        settled = local.parallax(local.keyframes[-_LOOKED_BACK:]).settled[track_ids]
+        if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
         tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, local.points[tracks])[:, 2]
@@ -251,26 +245,14 @@ class KeyframeOdometry:
         points = self._intrinsics.rays(pixels_before) * depth[:, None]
         local.points[tracks] = apply(invert(before.T_camera_world), points)
 
-    def _wants_keyframe(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, parallax_ratio: float) -> bool:
-        local, last = segment.map, segment.map.keyframes[-1]
-        if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS):
-            return True
-        limit = _PARALLAX_RATIO if len(local.keyframes) >= _YOUNG_KEYFRAMES else _YOUNG_PARALLAX_RATIO
-        before = last.pixels[np.searchsorted(last.track_ids, track_ids)]
-        moved = float(np.median(np.linalg.norm(pixels - before, axis=1))) / self._intrinsics.width
-        return parallax_ratio > limit or moved > _MOST_FLOW * limit
-
-    def _parallax_ratio(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> float:
-        """The median parallax to the last keyframe over the width of the image."""
-        last, intrinsics = segment.map.keyframes[-1], self._intrinsics
-        if not len(track_ids):
-            return 0.0
+    def _moved_since(self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> tuple[float, float]:
+        """Median parallax, and median shift, of corners ``(M, 2)`` since a keyframe, over the width of the image."""
+        intrinsics, before = self._intrinsics, last.pixels[np.searchsorted(last.track_ids, track_ids)]
         R = self._T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
-        rays_before = intrinsics.rays(last.pixels[np.searchsorted(last.track_ids, track_ids)])
-        parallax = parallax_px(
-            rays_before, intrinsics.rays(pixels.astype(np.float64)), R, (intrinsics.fx, intrinsics.fy)
-        )
-        return float(np.median(parallax)) / intrinsics.width
+        rays_before, rays = intrinsics.rays(before), intrinsics.rays(pixels.astype(np.float64))
+        parallax = parallax_px(rays_before, rays, R, (intrinsics.fx, intrinsics.fy))
+        shift = np.linalg.norm(pixels - before, axis=1)
+        return float(np.median(parallax)) / intrinsics.width, float(np.median(shift)) / intrinsics.width
 
     def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""
@@ -308,8 +290,8 @@ class KeyframeOdometry:
 
     def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
         """Keep an event and log it."""
-        self._events.append(TrackingEvent(frame, event, other, support))
-        logger.info("%s", self._events[-1])
+        self.events.append(TrackingEvent(frame, event, other, support))
+        logger.info("%s", self.events[-1])
 
     def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
         return TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world)

@@ -11,12 +11,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
-from slam.frontend.keyframes.depth_prior import Parallax
 from slam.frontend.keyframes.joining import moved
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment, Parallax, TrackedKeyframe
 from slam.frontend.keyframes.unit import learned_units
 from slam.geometry.resection import MIN_POINTS
 from slam.geometry.se3 import FloatArray, chain, invert
@@ -47,7 +45,9 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
     segment = _held(segment, np.where(tied, along, _UNKNOWN))
     local, keyframes = segment.map, segment.map.keyframes
-    number = np.concatenate([[0], np.cumsum(~(_carries(sigmas) & tied))])
+    begun, carries = np.flatnonzero(sigmas < _BEGUN), sigmas < _CARRIED
+    carries[: begun[0] if len(begun) else None] = True  # before points have parallax
+    number = np.concatenate([[0], np.cumsum(~(carries & tied))])
     pace = _pace([pair for pair, is_tied in zip(pairwise(keyframes), tied, strict=True) if is_tied])
     runs = [rows for n in range(number[-1] + 1) if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES]
     if not runs:
@@ -80,7 +80,7 @@ def _held(segment: MapSegment, carried: FloatArray) -> MapSegment:
     T = invert(np.array([keyframe.T_camera_world for keyframe in keyframes]))
     steps = invert(T[:-1]) @ T[1:]
     steps[:, :3, 3] *= np.sqrt(units[:-1] * units[1:])[:, None]
-    held = moved(segment, np.concatenate([np.eye(4)[None], chain(steps)[1:]]), units)
+    held = moved(segment, chain(steps), units)
     pairs = zip(held.map.keyframes, corrections, strict=True)
     held.map.keyframes = [replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs]
     return held
@@ -123,11 +123,3 @@ def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
         sigmas.append(1.0 / np.sqrt(max(_INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1), 1e-9)))
         parallax.see(keyframe.T_camera_world, tracks)
     return np.array(sigmas[1:])
-
-
-def _carries(sigmas: FloatArray) -> NDArray[np.bool_]:
-    """Whether points carry the unit from each keyframe to the next ``(K - 1,)``."""
-    begun = np.flatnonzero(sigmas < _BEGUN)
-    carries = sigmas < _CARRIED
-    carries[: begun[0] if len(begun) else None] = True
-    return carries

@@ -73,22 +73,11 @@ class KeyframePoses:
         """Poses of the frames in the first frame of their connected component of maps."""
         return chained(self.poses)
 
-    def frames_of(self, segment: int) -> list[int]:
-        """The frames of a segment."""
-        return [frame for frame, number in self.segments.items() if number == segment]
-
 
 def keyframe_poses(
     maps: Sequence[MapSegment], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
 ) -> KeyframePoses:
-    """All relative poses of some maps.
-
-    Args:
-        maps: of one drive.
-        intrinsics: of all images.
-        seed: of RANSAC.
-        loops: keyframes of one map that see the same place, by their frames.
-    """
+    """All relative poses of the maps of a drive; ``loops`` are keyframes of one map that see one place, by frames."""
     poses: list[RelativePose] = []
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.local_map import LocalMap
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert
 
@@ -37,11 +37,10 @@ def learned_unit(local: LocalMap) -> float:
 def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Learned depth over depth in the map along it ``(K,)``, and over what each keyframe says of it ``(K,)``.
 
-    Args:
-        local: the map.
-        carried: sigmas of the logarithm of the unit from each keyframe to the next ``(K - 1,)``, a random walk.
+    The logarithm of the unit is a random walk with sigmas ``carried`` ``(K - 1,)`` from each keyframe to the next.
     """
-    own = np.array([_logarithm(local, keyframe) for keyframe in local.keyframes])
+    known = [ratios[ratios > 0.0] for ratios in map(local.ratios, local.keyframes)]
+    own = np.array([-float(np.median(np.log(r))) if len(r) >= _LEAST_DEPTHS else np.nan for r in known])
     if not np.isfinite(own).any():
         return np.ones(len(own)), np.ones(len(own))
     weight = np.where(np.isfinite(own), 0.5 / _SHARED / _scatter(own) ** 2, 0.0)
@@ -53,12 +52,6 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
     system[1, :-1] += carried**-2.0
     walk = np.asarray(solveh_banded(system[-len(own) :], weight * own))
     return np.exp(walk), np.exp(np.where(weight > 0.0, walk - own, 0.0))
-
-
-def _logarithm(local: LocalMap, keyframe: TrackedKeyframe) -> float:
-    ratios = local.ratios(keyframe)
-    known = ratios[ratios > 0.0]
-    return -float(np.median(np.log(known))) if len(known) >= _LEAST_DEPTHS else np.nan
 
 
 def _scatter(logarithms: FloatArray) -> float:
@@ -73,10 +66,7 @@ def _scatter(logarithms: FloatArray) -> float:
 def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0) -> list[float]:
     """The units of maps, so that the camera has one height in all that see a floor; learned ones where it contradicts.
 
-    Args:
-        maps: of one drive.
-        learned_units: of learned depth per unit of each map.
-        seed: of the planes drawn.
+    ``learned_units`` are those of learned depth per unit of each map, ``seed`` is that of the planes drawn.
     """
     units, floors = list(learned_units), {}
     for row, local in enumerate(maps if len(maps) > 1 else ()):
@@ -97,7 +87,7 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
     T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in local.keyframes]))
     centres, down = T_map_camera[:, :3, 3], T_map_camera[:, :3, 1].mean(axis=0)
     seen = np.unique(np.concatenate([keyframe.track_ids for keyframe in local.keyframes]))
-    points = local.points[seen[local.parallax().settled[seen]]]
+    points = local.points[seen[local.parallax(local.keyframes).settled[seen]]]
     if len(points) < _LEAST_POINTS:
         return None
     origin = np.median(centres, axis=0)

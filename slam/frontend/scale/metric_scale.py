@@ -8,20 +8,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from slam.config.sections import ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_from_road, scale_track
-from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
-from slam.frontend.visual.motion import Motion, links, triangulated
+from slam.frontend.scale.step_lengths import gather_evidence, solve_lengths
+from slam.frontend.visual.motion import links, triangulated
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
@@ -30,8 +30,7 @@ _LEAST_ROAD = 1 / 3  # of the frames, half of which have learned depth; fewer se
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 
 
-@dataclass(frozen=True)
-class StepLength:
+class StepLength(NamedTuple):
     """A length, its relative sigma, and the sigma of independent errors that add up as its correlated ones do."""
 
     value: float
@@ -48,7 +47,7 @@ class Scale:
     """
 
     mode: ScaleMode
-    estimate: ScaleEstimate | MeasurementFailure
+    estimate: ScaleEstimate | Failed
     per_frame: FloatArray
     lengths: Mapping[Ends, StepLength]
     unit: LengthUnit
@@ -64,14 +63,14 @@ class Scale:
         """``m``, with mode none ``unit``; None where metres were not found."""
         return "m" if self.is_metric else self.unit if self.mode == "none" else None
 
-    def in_metres(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
+    def in_metres(self, other: ScaleEstimate | Failed) -> Scale:
         """In metres, by those per unit of this scale; where they were not found the unit stays."""
-        if isinstance(other, MeasurementFailure):
+        if isinstance(other, Failed):
             logger.warning("no scale (%s): lengths stay in %s", other.reason, self.unit)
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
         estimate = replace(other, value=float(np.median(per_frame)))
-        lengths = {ends: replace(length, value=other.value * length.value) for ends, length in self.lengths.items()}
+        lengths = {ends: length._replace(value=other.value * length.value) for ends, length in self.lengths.items()}
         return replace(self, estimate=estimate, per_frame=per_frame, lengths=lengths, unit="metres")
 
     def scaled(self, measured: RelativePose) -> RelativePose:
@@ -100,8 +99,9 @@ def find_scale(
         sigmas = {pose.ends: float(pose.sigmas[3]) for pose in lidar_steps}
         absolute |= {ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0}
     by_planes = scale_from_road(drive.roads, height)
-    if isinstance(by_planes, MeasurementFailure):
-        prior_unit = np.full(frames, _unit_by_steps(motions, absolute))
+    if isinstance(by_planes, Failed):
+        ratios = [absolute[ends][0] / motion.length_unscaled for ends, motion in motions.items() if ends in absolute]
+        prior_unit = np.full(frames, float(np.median(ratios)) if ratios else 1.0)
     elif absolute:
         # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
         prior_unit = np.full(frames, by_planes.value)
@@ -109,9 +109,9 @@ def find_scale(
         prior_unit = scale_track(drive.roads, height, by_planes)
     steps = links(motions, frames)
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
-    if not isinstance(by_planes, MeasurementFailure):
+    if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
-        evidence = evidence.without_contradicted(_MAX_CONTRADICTION)
+        evidence.absolute[np.abs(evidence.absolute - evidence.learned) > np.log(_MAX_CONTRADICTION)] = np.nan
     solved = solve_lengths(evidence)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]
@@ -123,23 +123,17 @@ def find_scale(
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
-    elif isinstance(by_planes, MeasurementFailure):
+    elif isinstance(by_planes, Failed):
         named = "the networks' own unit"
         logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
-    if named == "camera heights" and _frames_with_road(by_planes, used) < _LEAST_ROAD * frames:
+    # by learned depth, or by the homography of steps
+    with_road = max(used, 0 if isinstance(by_planes, Failed) else by_planes.frames_used)
+    if named == "camera heights" and with_road < _LEAST_ROAD * frames:
         named = "no metric unit"
     contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
-    return Scale(mode, estimate, per_frame, _measured_lengths(steps, solved), named, contradicted)
-
-
-def _frames_with_road(by_planes: ScaleEstimate | MeasurementFailure, steps: int) -> int:
-    """Frames that see a road by learned depth, or by the homography of so many steps."""
-    return max(steps, 0 if isinstance(by_planes, MeasurementFailure) else by_planes.frames_used)
-
-
-def _measured_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, StepLength]:
     rows = zip(steps, solved.length, solved.relative_sigma, solved.relative_correlated_sigma, strict=True)
-    return {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
+    lengths = {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
+    return Scale(mode, estimate, per_frame, lengths, named, contradicted)
 
 
 def _lengths(steps: Sequence[RelativePose]) -> dict[Ends, float]:
@@ -158,9 +152,3 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
             if ends in metres and isinstance(plane := drive.roads[ends[0]], GroundPlane)
         ]
     return float(np.median(heights)) if heights else None
-
-
-def _unit_by_steps(motions: Mapping[Ends, Motion], absolute: Mapping[Ends, tuple[float, float]]) -> float:
-    """Unit of learned depth from steps of known length; 1 where there are none."""
-    ratios = [absolute[ends][0] / motion.length_unscaled for ends, motion in motions.items() if ends in absolute]
-    return float(np.median(ratios)) if ratios else 1.0

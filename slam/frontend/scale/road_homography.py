@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Frame, Intrinsics, Mask, resized_mask
-from slam.frontend.failure import MeasurementFailure
+from slam.frontend.image_gate import slopes_of
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
 _LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # searched; refinement converges between them
@@ -84,7 +85,7 @@ class RoadHomography:
 
     def measure(
         self, previous: Frame, current: Frame, T_previous_current: FloatArray, standing: Mask | None = None
-    ) -> RoadStep | MeasurementFailure:
+    ) -> RoadStep | Failed:
         """Measure the length of a step whose rotation and direction are known.
 
         Args:
@@ -98,7 +99,8 @@ class RoadHomography:
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions = (*self._directions, T_unit[:3, 3])[-_STEPS_KEPT:]
-        expected = self._expected()
+        # of a level camera, pitched so that the motion is parallel to the road: the images alone tell pitch poorly
+        expected = _normal_along(np.median(self._directions, axis=0))
         long, near = self._strips
         measured = self._measured_on(long, previous, current, T_unit, expected)
         if isinstance(measured, RoadStep):
@@ -114,50 +116,35 @@ class RoadHomography:
 
     def _measured_on(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
-    ) -> RoadStep | MeasurementFailure:
+    ) -> RoadStep | Failed:
         if len(strip.rows) < _MIN_POINTS:
-            return MeasurementFailure("the image shows too little of the road")
-        step, correlation, standing = self._aligned(strip, previous, current, T_unit, expected)
-        plane = step.plane
-        length = float(np.linalg.norm(plane))
-        normal = plane / length
-        deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
-        if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
-            return MeasurementFailure(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
-        if correlation < _MIN_CORRELATION:
-            return MeasurementFailure(f"both images of the road do not correlate ({correlation:.2f})")
-        if 1.0 - correlation > (1.0 - _MIN_GAIN) * (1.0 - standing):
-            return MeasurementFailure(f"the image in front of the car stands still (correlation {standing:.2f})")
-        return step
-
-    def _aligned(
-        self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
-    ) -> tuple[RoadStep, float, float]:
-        """The step that aligns the road, and the correlation of both images with and without it."""
+            return Failed("the image shows too little of the road")
         before, now = self._layers(previous), self._layers(current)
         plane = self._search(strip, before[0], now[0], T_unit, expected)
         for layer_before, layer_now in zip(before, now, strict=True):
             step, correlation = self._refine(strip, layer_before, layer_now, T_unit, plane, expected)
             plane = step.plane
         standing = _correlation(*(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now)))
-        return step, correlation, standing
-
-    def _expected(self) -> FloatArray:
-        """The expected normal ``(3,)``: that of a level camera, pitched so that the motion is parallel to the road.
-
-        The images alone determine pitch and length poorly; the direction of motion determines pitch well.
-        """
-        return _normal_along(np.median(self._directions, axis=0))
+        length = float(np.linalg.norm(plane))
+        deviation = float(np.arccos(np.clip(plane / length @ expected, -1.0, 1.0)))
+        if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
+            return Failed(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
+        if correlation < _MIN_CORRELATION:
+            return Failed(f"both images of the road do not correlate ({correlation:.2f})")
+        if 1.0 - correlation > (1.0 - _MIN_GAIN) * (1.0 - standing):
+            return Failed(f"the image in front of the car stands still (correlation {standing:.2f})")
+        return step
 
     def _layers(self, frame: Frame) -> list[_Layer]:
         """A coarse image ``(H', W, 3)`` below the horizon, high-pass filtered, and the image, both with gradients."""
-        return frame.derived(("road layers", self._top_row, self._intrinsics.fx), lambda: self._filtered(frame))
 
-    def _filtered(self, frame: Frame) -> list[_Layer]:
-        grey = frame.grey[self._top_row :].astype(np.float32)
-        local = grey - _gradual(grey, _gradual_px(self._intrinsics))
-        coarse = cv2.GaussianBlur(local, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
-        return [_with_gradients(layer) for layer in (coarse, grey)]
+        def filtered() -> list[_Layer]:
+            grey = frame.grey[self._top_row :].astype(np.float32)
+            local = grey - _gradual(grey, _gradual_px(self._intrinsics))
+            coarse = cv2.GaussianBlur(local, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
+            return [np.asarray(cv2.merge([layer, *slopes_of(layer)])) for layer in (coarse, grey)]
+
+        return frame.derived(("road layers", self._top_row, self._intrinsics.fx), filtered)
 
     def _sampled(self, layer: _Layer, points_previous: _Layer) -> _Layer:
         """Grey levels and gradients ``(..., P, 3)`` of the earlier image at points ``(..., 3, P)`` of its camera."""
@@ -298,8 +285,3 @@ def _ahead(points: _Layer) -> _Layer:
 
 def _correlation(a: _Layer, b: _Layer) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
-
-
-def _with_gradients(layer: _Layer) -> _Layer:
-    slopes = [cv2.Sobel(layer, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
-    return np.asarray(cv2.merge([layer, *slopes]))

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Intrinsics
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 _POINTS = 1500
 _LEAST_POINTS = 50
@@ -45,7 +45,7 @@ class GroundPlaneFitter:
         self._seed = seed
         self._rows, self._columns, self._rays = _trapezoid(intrinsics)
 
-    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> GroundPlane | MeasurementFailure:
+    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> GroundPlane | Failed:
         """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics, without the bias by its ``error``.
 
         Unknown depth is left out.
@@ -54,19 +54,19 @@ class GroundPlaneFitter:
         inverse_depth = 1.0 / np.maximum(depth, 1e-9)
         usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
         if usable.sum() < _LEAST_POINTS:
-            return MeasurementFailure("the depth in front of the car is not usable")
+            return Failed("the depth in front of the car is not usable")
         rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
         scaled_normal = _ransac(rays, inverse_depth, self._seed)
         if scaled_normal is None:
-            return MeasurementFailure(f"no plane within {_MAX_TILT_DEG:g} deg of level in front of the car")
+            return Failed(f"no plane within {_MAX_TILT_DEG:g} deg of level in front of the car")
         scaled_normal = _reweighted(rays, inverse_depth, scaled_normal, _INLIER_RELATIVE_DEPTH)
         height = 1.0 / float(np.linalg.norm(scaled_normal))
         normal = scaled_normal * height
         inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
         if normal[1] < np.cos(np.deg2rad(_MAX_TILT_DEG)):
-            return MeasurementFailure(f"the plane in front of the car is tilted by more than {_MAX_TILT_DEG:g} deg")
+            return Failed(f"the plane in front of the car is tilted by more than {_MAX_TILT_DEG:g} deg")
         if inlier_ratio < _MIN_INLIER_RATIO:
-            return MeasurementFailure(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
+            return Failed(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
         return GroundPlane(height, normal, inlier_ratio)
 
 

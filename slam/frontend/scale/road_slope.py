@@ -8,13 +8,14 @@ frame the path is parallel to the road; where directions are noisy, it is so onl
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from itertools import groupby
 
 import numpy as np
 
 from slam.frames import Ends
 from slam.frontend.scale.road_homography import RoadStep
-from slam.frontend.visual.motion import Steps, shortest_by_start, triangulated
+from slam.frontend.visual.motion import Steps, links, triangulated
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, path_distance
 
@@ -25,12 +26,7 @@ _OF_PATH = 0.5  # noise of the path's direction over that of a single step
 
 
 def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, RoadStep]:
-    """The lengths of a drive by the road, with its normal by the path.
-
-    Args:
-        road_steps: as they were measured.
-        steps: all of the drive, unscaled.
-    """
+    """The lengths of a drive by the road, with its normal by the path of all ``steps``, unscaled."""
     motions = {ends: motion for ends, motion in triangulated(steps).items() if ends in road_steps}
     if not motions:
         return dict(road_steps)
@@ -49,7 +45,11 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, 
 def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
     """The direction ``(3,)`` of the path within ``reach`` of a frame, in its camera, by the frame."""
     found: dict[int, FloatArray] = {}
-    for run in _runs(steps):
+    frames = 1 + max((last for _, last in steps), default=0)
+    for is_measured, consecutive in groupby(links(steps, frames), steps.__contains__):
+        if not is_measured:
+            continue
+        run = list(consecutive)
         T = chain(np.array([steps[ends].relative_pose.T_from_to for ends in run]))
         places = path_distance(T)
         behind, ahead = (
@@ -57,21 +57,7 @@ def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
             for sign in (-1, 1)
         )
         chords = np.einsum("nba,nb->na", T[:, :3, :3], ahead - behind)
-        frames = [run[0][0], *(last for _, last in run)]
-        known = zip(frames, chords, np.linalg.norm(chords, axis=1), strict=True)
+        seen_from = [run[0][0], *(last for _, last in run)]
+        known = zip(seen_from, chords, np.linalg.norm(chords, axis=1), strict=True)
         found |= {frame: chord / length for frame, chord, length in known if length > reach}
     return found
-
-
-def _runs(steps: Steps) -> Iterator[list[Ends]]:
-    """Steps of which each begins where the one before ends."""
-    run: list[Ends] = []
-    for ends in shortest_by_start(steps).values():
-        if run and ends[0] < run[-1][1]:
-            continue
-        if run and ends[0] != run[-1][1]:
-            yield run
-            run = []
-        run.append(ends)
-    if run:
-        yield run

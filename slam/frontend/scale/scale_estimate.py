@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.config.sections import ScaleConfig, ScaleMode
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import Failed, SlamError
 
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
 _REJECTION_SIGMAS = 3.0  # distance from the median beyond which a frame is left out
@@ -41,25 +40,32 @@ def resolve_mode(config: ScaleConfig, camera_height_m: float | None, has_gps: bo
     return "gps" if has_gps else "none"
 
 
-def scale_from_road(
-    roads: Sequence[GroundPlane | MeasurementFailure], camera_height_m: float | None
-) -> ScaleEstimate | MeasurementFailure:
-    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none)."""
+def scale_from_road(roads: Sequence[GroundPlane | Failed], camera_height_m: float | None) -> ScaleEstimate | Failed:
+    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none).
+
+    The median over the frames without outliers, which are many MADs away.
+    """
     height = 1.0 if camera_height_m is None else camera_height_m
-    ratios = [height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)]
-    return estimate_scale(np.array(ratios))
+    ratios = np.array([height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)])
+    if len(ratios) < MIN_FRAMES:
+        return Failed(f"only {len(ratios)} frames measure the scale, {MIN_FRAMES} are needed")
+    logarithms = np.log(ratios)
+    deviations = np.abs(logarithms - np.median(logarithms))
+    kept = logarithms[deviations <= _REJECTION_SIGMAS * mad_sigma(deviations) + 1e-12]
+    spread = mad_sigma(kept - np.median(kept))
+    return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
 
 def scale_from_reference(
     T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray
-) -> ScaleEstimate | MeasurementFailure:
+) -> ScaleEstimate | Failed:
     """True path length over estimated path length of the first 50 frames."""
     estimated, true = (
         np.linalg.norm(np.diff(T[:_REFERENCE_FRAMES, :3, 3], axis=0), axis=1)
         for T in (T_world_camera_unscaled, T_world_camera_true)
     )
     if estimated.sum() <= 0 or true.sum() <= 0:
-        return MeasurementFailure(f"the camera does not move within the first {_REFERENCE_FRAMES} frames")
+        return Failed(f"the camera does not move within the first {_REFERENCE_FRAMES} frames")
     value = float(true.sum() / estimated.sum())
     moving = estimated > 0.1 * estimated.mean()
     spread = float(np.std(true[moving] / estimated[moving] / value))
@@ -95,30 +101,17 @@ def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
 
 def scale_from_distance(
     T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
-) -> ScaleEstimate | MeasurementFailure:
+) -> ScaleEstimate | Failed:
     """The known distance of two frames over their estimated distance; raises as `known_frames`."""
     first, second = known_frames(config, stamps)
     apart = np.linalg.norm(T_world_camera_unscaled[second, :3, 3] - T_world_camera_unscaled[first, :3, 3])
     if config.known_m is None or not apart > 0:
-        return MeasurementFailure(f"the camera does not move between frames {first} and {second}")
+        return Failed(f"the camera does not move between frames {first} and {second}")
     return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
 
 
-def estimate_scale(ratios: FloatArray) -> ScaleEstimate | MeasurementFailure:
-    """One scale from a ratio per frame ``(K,)``: their median without outliers, which are many MADs away."""
-    ratios = np.asarray(ratios, dtype=np.float64)
-    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
-    if len(ratios) < MIN_FRAMES:
-        return MeasurementFailure(f"only {len(ratios)} frames measure the scale, {MIN_FRAMES} are needed")
-    logarithms = np.log(ratios)
-    deviations = np.abs(logarithms - np.median(logarithms))
-    kept = logarithms[deviations <= _REJECTION_SIGMAS * mad_sigma(deviations) + 1e-12]
-    spread = mad_sigma(kept - np.median(kept))
-    return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
-
-
 def scale_track(
-    roads: Sequence[GroundPlane | MeasurementFailure],
+    roads: Sequence[GroundPlane | Failed],
     camera_height_m: float | None,
     estimate: ScaleEstimate,
 ) -> FloatArray:

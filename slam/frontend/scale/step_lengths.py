@@ -14,7 +14,7 @@ solved for the whole drive by robust least squares, whose matrix is banded (``do
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,11 +65,6 @@ class StepEvidence:
     def empty(cls, steps: int) -> StepEvidence:
         """Without a measurement."""
         return cls(*(np.full(steps, np.nan) for _ in range(7)))
-
-    def without_contradicted(self, factor: float) -> StepEvidence:
-        """The same without absolute lengths that differ from learned ones by more than ``factor``."""
-        contradicted = np.abs(self.absolute - self.learned) > np.log(factor)
-        return replace(self, absolute=np.where(contradicted, np.nan, self.absolute))
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,7 @@ class FocalLength:
     ) -> Self:
         """After one more step, whose rotation and direction are eliminated.
 
-        Args:
-            rays_previous: of corners on their epipolar lines ``(M, 3)``, z = 1.
-            rays_current: of the same corners.
-            unit_pose: the motion that they fit.
-            focal_px: the stated focal length.
+        By the rays ``(M, 3)``, z = 1, of corners on their epipolar lines; ``focal_px`` is the stated focal length.
         """
         tangent, unknown = tangent_of(unit_pose.direction), np.full(len(rays_previous), np.nan)
 

@@ -1,4 +1,4 @@
-"""Motions measured by optical flow: relative poses whose length may be measured separately, and paths of them.
+"""Motions measured by optical flow: relative poses whose length may be measured separately, their paths and history.
 
 A step is from a frame to a later one: usually the next, but it may also cross a gap. The links of a drive are
 consecutive steps from the first frame to the last; where no step was measured, a link is to the next frame.
@@ -8,13 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from slam.frames import Ends, RelativePose
+from slam.geometry.epipolar import UnitRelativePose
+from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_RELATIVE_SIGMA = 1e-3
+# of the history
+AXIS_SIGMA = float(np.deg2rad(8.0))  # least one of the direction of motion, radians
+_STEPS_KEPT = 100
+_LEAST_STEPS = 10
+_SUDDEN_SHARE = 2.0 / 3.0
+_SHARES = 10
+_SPEEDS = 3
+# of a car, in camera heights: 10 m/s2 at 1.65 m
+_MOST_ACCELERATION = 6.0
+_LENGTH_RELATIVE_SIGMA = 0.1
 
 
 @dataclass(frozen=True)
@@ -50,18 +63,9 @@ class Motion:
 
     @property
     def corner_sigmas(self) -> FloatArray:
-        """Sigmas ``(6,)`` of rotation and direction by the corners' own covariance.
-
-        Raises:
-            ValueError: its direction was not measured separately from its length.
-        """
-        if self.covariance is None:
-            raise ValueError(f"a motion by {self.relative_pose.source} has no separate noise of its direction")
+        """Sigmas ``(6,)`` of rotation and direction by the corners' own covariance, of a triangulated motion."""
+        assert self.covariance is not None
         return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    def with_pose(self, T_from_to: FloatArray) -> Motion:
-        """The same with another pose ``(4, 4)``."""
-        return replace(self, relative_pose=replace(self.relative_pose, T_from_to=T_from_to))
 
     def with_length(
         self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: FloatArray
@@ -108,10 +112,7 @@ class RelativeRotation:
 def pose_sigmas(T_previous_current: FloatArray, of_unit_pose: FloatArray, length_relative_sigma: float) -> FloatArray:
     """Sigmas ``(6,)`` of a pose in the current camera, where GTSAM perturbs.
 
-    Args:
-        T_previous_current: the pose ``(4, 4)``.
-        of_unit_pose: sigmas ``(6,)`` of its rotation and direction, radians.
-        length_relative_sigma: of the length.
+    By those ``of_unit_pose`` ``(6,)``, its rotation and direction in radians, and by that of its length.
     """
     along = np.abs(invert(T_previous_current)[:3, 3])
     length = float(np.linalg.norm(along))
@@ -156,3 +157,60 @@ def links(steps: Iterable[Ends], frames: int) -> list[Ends]:
         found.append(by_start.get(frame, (frame, frame + 1)))
         frame = found[-1][1]
     return found
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """The usual direction of motion ``axis`` ``(3,)`` and its sigma, radians."""
+
+    axis: FloatArray
+    axis_sigma: float
+
+
+@dataclass(frozen=True)
+class MotionHistory:
+    """Directions, inlier ratios and speeds (camera heights a second, NaN where unknown) of the last steps.
+
+    ``last`` is the last motion.
+    """
+
+    directions: tuple[FloatArray, ...] = ()
+    inlier_ratios: tuple[float, ...] = ()
+    speeds: tuple[float, ...] = ()
+    last: UnitRelativePose | None = None
+
+    def with_step(self, measured: UnitRelativePose, inlier_ratio: float, speed: float) -> Self:
+        """The history after one more step."""
+        return replace(
+            self,
+            directions=(*self.directions, measured.direction)[-_STEPS_KEPT:],
+            inlier_ratios=(*self.inlier_ratios, inlier_ratio)[-_SHARES:],
+            speeds=(*self.speeds, speed)[-_SPEEDS:],
+            last=measured,
+        )
+
+    def is_sudden_loss(self, inlier_ratio: float) -> bool:
+        """Whether a third of the usual inliers are outliers now."""
+        known = len(self.inlier_ratios) >= _LEAST_STEPS
+        return known and inlier_ratio < _SUDDEN_SHARE * float(np.median(self.inlier_ratios))
+
+    def is_possible_speed(self, speed: float, seconds: float) -> bool | None:
+        """Whether a car can have this speed after a step of so many seconds; None where speeds are unknown.
+
+        Lengths by learned depth have a relative error of their own, three sigmas of which are granted.
+        """
+        if len(self.speeds) < _SPEEDS or not np.isfinite([*self.speeds, speed]).all():
+            return None
+        usual = float(np.median(self.speeds))
+        passed = seconds * (_SPEEDS + 1) / 2
+        return abs(speed - usual) < _MOST_ACCELERATION * passed + 3.0 * _LENGTH_RELATIVE_SIGMA * max(speed, usual)
+
+    def prior(self) -> MotionPrior:
+        """The prior of the next motion; without a direction after too few steps."""
+        if len(self.directions) < _LEAST_STEPS:
+            return MotionPrior(np.zeros(3), np.inf)
+        directions = np.array(self.directions)
+        axis = np.median(directions, axis=0)
+        axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
+        spread = mad_sigma(np.arccos(np.clip(directions @ axis, -1.0, 1.0)))
+        return MotionPrior(axis, float(np.hypot(AXIS_SIGMA, spread)))

@@ -13,7 +13,7 @@ not hold the majority of the image's parallax.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import cv2
@@ -24,6 +24,7 @@ from slam.geometry.se3 import FloatArray
 
 _CELL_PX = 8.0
 _SPREAD_CELLS = 1.5
+_SHARPNESS = 4.0  # power of a cell's inlier ratio over that of the whole image, by which corners weigh
 # decay a step: a half-life of seven steps
 _KEPT = 0.9
 # weight, in corners, of the prior that a cell has the inlier ratio of the whole image
@@ -37,20 +38,16 @@ _CONSISTENCY = 0.5
 
 @dataclass(frozen=True)
 class DynamicMask:
-    """Inliers and all corners of the last steps by cell of the image ``(h, w)``, decayed exponentially.
-
-    ``sharpness`` is the power of a cell's inlier ratio over that of the whole image; 0 weights all cells equally.
-    """
+    """Inliers and all corners of the last steps by cell of the image ``(h, w)``, decayed exponentially."""
 
     inliers: FloatArray
     corners: FloatArray
-    sharpness: float
 
     @classmethod
-    def empty(cls, width: int, height: int, sharpness: float) -> Self:
+    def empty(cls, width: int, height: int) -> Self:
         """A mask without observations for images of ``width`` x ``height`` pixels."""
         shape = int(np.ceil(height / _CELL_PX)), int(np.ceil(width / _CELL_PX))
-        return cls(np.zeros(shape), np.zeros(shape), sharpness)
+        return cls(np.zeros(shape), np.zeros(shape))
 
     def weights(self, pixels: FloatArray) -> FloatArray:
         """Weights in (0, 1] ``(M,)`` of corners at ``pixels`` ``(M, 2)``."""
@@ -59,7 +56,7 @@ class DynamicMask:
         usual = self.inliers.sum() / self.corners.sum()
         inliers, corners = (cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self.inliers, self.corners))
         ratio = (inliers + _PRIOR_CORNERS * usual) / (corners + _PRIOR_CORNERS)
-        return np.asarray(np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** self.sharpness)
+        return np.asarray(np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS)
 
     def updated(self, pixels: FloatArray, is_inlier: NDArray[np.bool_]) -> Self:
         """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""
@@ -67,7 +64,7 @@ class DynamicMask:
         cells = self._cells(pixels)
         np.add.at(corners, cells, 1.0)
         np.add.at(inliers, cells, is_inlier.astype(float))
-        return replace(self, inliers=inliers, corners=corners)
+        return type(self)(inliers, corners)
 
     def _cells(self, pixels: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         column, row = (np.floor(pixels.T / _CELL_PX)).astype(np.int64)

@@ -25,12 +25,10 @@ from slam.frames import (
     resized_depth,
     trusted_depth,
 )
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
-from slam.frontend.visual.motion import Motion, RelativeRotation, pose_sigmas
-from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.motion import Motion, MotionHistory, RelativeRotation, pose_sigmas
 from slam.frontend.visual.moving_regions import DynamicMask
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.step_check import Step, TriangulatedPoints, most_credible
@@ -53,6 +51,7 @@ from slam.geometry.epipolar import (
 from slam.geometry.resection import consensus, resect
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
+from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
 MIN_INLIERS = 20  # of a measurement: each satisfies both constraints
@@ -60,7 +59,6 @@ ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
 _MIN_RATIOS = 8
-_MASK_SHARPNESS = 4.0  # exponent on the local inlier ratio that weighs corners down on moving objects
 _PNP_ITERATIONS = 200
 _LEAST_PNP_SHARE = 0.5  # of the corners: what fewer agree on is chance
 _LEARNED_RELATIVE_SIGMA = 0.1
@@ -88,14 +86,16 @@ class VisualOdometry:
 
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Prepare for the first frames; ``seed`` is that of RANSAC."""
-        self._working = WorkingSize(intrinsics)
-        self._intrinsics = intrinsics = self._working.camera
+        ratio = float(np.sqrt(_MOST_PIXELS / (intrinsics.width * intrinsics.height)))
+        if ratio < 1.0:
+            intrinsics = intrinsics.resized(round(ratio * intrinsics.width), round(ratio * intrinsics.height))
+        self._intrinsics, self._size = intrinsics, (intrinsics.width, intrinsics.height)
         self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
         self._tracker = CornerTracker()
         self._two_views = TwoViewEstimator(intrinsics.fx, seed)
         self.depth_error, self.focal_length = DepthError(), FocalLength()
-        self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height, _MASK_SHARPNESS)
+        self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
         self._last: Motion | None = None  # to the last frame, where one was measured
         self._points: TriangulatedPoints | None = None  # by the last motion that corners alone gave
@@ -110,7 +110,7 @@ class VisualOdometry:
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
         standing: Mask | None = None,
-    ) -> Motion | MeasurementFailure:
+    ) -> Motion | Failed:
         """Measure the motion between two frames, the next two of the sequence or with others left out between them.
 
         Args:
@@ -121,12 +121,12 @@ class VisualOdometry:
                 30 times as much are not trusted.
             standing: pixels ``(h, w)`` that do not show the world, of images of any size; None where all do.
         """
-        previous, current = self._working.frame(previous), self._working.frame(current)
-        depth_previous_unscaled = self._working.depth(depth_previous_unscaled)
+        previous, current = self._reduced(previous), self._reduced(current)
+        depth_previous_unscaled = self._reduced_depth(depth_previous_unscaled)
         flow = self._predicted_flow(previous, current, depth_previous_unscaled)
         tracks = self._tracker.track(previous, current, flow, standing)
         if len(tracks) < MIN_INLIERS:
-            measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
+            measured: Motion | Failed = Failed(f"only {len(tracks)} corners could be tracked")
         else:
             learned = nearest_depth(depth_previous_unscaled, tracks.previous)
             depth = trusted_depth(learned, height_unscaled)
@@ -140,27 +140,19 @@ class VisualOdometry:
         return measured
 
     def carried(self, depth_previous_unscaled: DepthMap, motion: Motion) -> DepthMap | None:
-        """Depth ``(h, w)`` at the later frame of a measured motion, NaN where unknown; None where nothing moved.
+        """Depth ``(h, w)`` at the later frame of a motion from that ``(H, W)`` at the earlier one, NaN where unknown.
 
-        Args:
-            depth_previous_unscaled: z-depth ``(H, W)`` of the earlier frame.
-            motion: from it.
+        None where nothing moved.
         """
         known = UnitRelativePose.of(motion.relative_pose.T_from_to)
         if known is None:
             return None
-        return PredictedFlow(*known, self._working.depth(depth_previous_unscaled), self._intrinsics).depth_current()
+        return PredictedFlow(*known, self._reduced_depth(depth_previous_unscaled), self._intrinsics).depth_current()
 
     def relative_rotation(
         self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
     ) -> Callable[[], RelativeRotation | None]:
-        """Prepare to measure the rotation between two frames some steps apart.
-
-        Args:
-            first: the earlier frame.
-            last: the later frame.
-            depth_first_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
-            T_first_last: the chained motion of the steps, unscaled.
+        """Prepare to measure the rotation between two frames some steps apart, whose motion is about ``T_first_last``.
 
         Returns:
             A function that measures it from the present state, in any thread; its result is None with too few corners.
@@ -168,8 +160,8 @@ class VisualOdometry:
         known = UnitRelativePose.of(T_first_last)
         if known is None:
             return lambda: None
-        first, last = self._working.frame(first), self._working.frame(last)
-        depth_first_unscaled = self._working.depth(depth_first_unscaled)
+        first, last = self._reduced(first), self._reduced(last)
+        depth_first_unscaled = self._reduced_depth(depth_first_unscaled)
         find = self._tracker.track_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
         mask, error = self._dynamic_mask, self.depth_error
 
@@ -237,7 +229,7 @@ class VisualOdometry:
         votes: NDArray[np.bool_],
         learned: FloatArray,
         height: float | None,
-    ) -> Motion | MeasurementFailure | None:
+    ) -> Motion | Failed | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         matches = self._matches(tracks, votes, learned, height, self._dynamic_mask, self.depth_error)
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
@@ -265,7 +257,7 @@ class VisualOdometry:
             alone = step(matches.by_geometry_alone(), MotionHistory())
             credible = most_credible([usual, alone], matches, height, seconds, history)
             if credible is None:
-                return MeasurementFailure("the step contradicts the road and the steps before")
+                return Failed("the step contradicts the road and the steps before")
             chosen = credible
             logger.info("geometry %d -> %d: %s", *ends, "as usual" if chosen is usual else "by corners alone")
         self._learn(tracks, matches, learned, chosen, chosen.speed(height, seconds))
@@ -308,7 +300,9 @@ class VisualOdometry:
         # errors of learned depth are correlated in patches: one in ten counts as independent
         spread *= MAD_TO_SIGMA * CORNER_CORRELATION / float(np.sqrt(max(measures.sum() / 10.0, 1.0)))
         T_previous_current = invert(make(unit_pose.R_current_previous, length * unit_pose.direction))
-        covariance = _with_floors(two_view)
+        across = np.maximum(1.0 - unit_pose.direction**2, 0.0)
+        floors = np.concatenate([np.full(3, _ROTATION_FLOOR_DEG), _DIRECTION_FLOOR_DEG * np.sqrt(across)])
+        covariance = two_view.covariance + np.diag(np.deg2rad(floors) ** 2)
         depth_current = depth_in_current(rays_previous, depth_previous, unit_pose)
         solid &= depth_current > 0
         triangulated = TriangulatedPoints(
@@ -323,13 +317,11 @@ class VisualOdometry:
         motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
         return Step(motion, two_view, triangulated)
 
-    def _by_points(
-        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
-    ) -> Motion | MeasurementFailure:
+    def _by_points(self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray) -> Motion | Failed:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth) & votes
         if known.sum() < MIN_INLIERS:
-            return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
+            return Failed(f"only {int(known.sum())} corners have a trusted depth")
         corrected = self.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
@@ -337,7 +329,7 @@ class VisualOdometry:
         count = 0 if start is None else len(start[1])
         if start is None or count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
-            return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
+            return Failed(f"little parallax, and only {known_corners} agree with the learned depth")
         T_start, inliers = start
         resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
         self._fitted = tracks.track_ids[known][inliers]
@@ -348,19 +340,8 @@ class VisualOdometry:
         pose = RelativePose(*ends, invert(resection.T_camera_world), sigmas, PNP_SOURCE)
         return Motion(pose, support=count / tracks.sought)
 
-
-class WorkingSize:
-    """Reduces images and depth of one camera; those of at most a megapixel stay as they are."""
-
-    def __init__(self, intrinsics: Intrinsics) -> None:
-        """``camera`` is that of the reduced images."""
-        ratio = float(np.sqrt(_MOST_PIXELS / (intrinsics.width * intrinsics.height)))
-        size = round(ratio * intrinsics.width), round(ratio * intrinsics.height)
-        self.camera = intrinsics if ratio >= 1.0 else intrinsics.resized(*size)
-        self._size = self.camera.width, self.camera.height
-
-    def frame(self, frame: Frame) -> Frame:
-        """The frame with its reduced image."""
+    def _reduced(self, frame: Frame) -> Frame:
+        """The frame with an image of at most a megapixel."""
 
         def reduced() -> Frame:
             image: Image = np.asarray(cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -368,13 +349,6 @@ class WorkingSize:
 
         return frame if frame.image.shape[1::-1] == self._size else frame.derived(("reduced", self._size), reduced)
 
-    def depth(self, depth: DepthMap) -> DepthMap:
+    def _reduced_depth(self, depth: DepthMap) -> DepthMap:
         """The depth map ``(h, w)`` of the reduced image."""
         return depth if depth.shape[::-1] == self._size else resized_depth(depth, *self._size)
-
-
-def _with_floors(two_view: TwoViewEstimate) -> FloatArray:
-    """Covariance ``(6, 6)`` of rotation and direction, in the current camera, where GTSAM perturbs."""
-    across = np.maximum(1.0 - two_view.unit_pose.direction**2, 0.0)
-    floors = np.deg2rad(np.concatenate([np.full(3, _ROTATION_FLOOR_DEG), _DIRECTION_FLOOR_DEG * np.sqrt(across)]))
-    return np.asarray(two_view.covariance + np.diag(floors**2))

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.motion import Motion, MotionHistory
 from slam.frontend.visual.two_view import Matches, TwoViewEstimate
 from slam.geometry.epipolar import triangulated_depth
 from slam.geometry.robust import mad_sigma, weighted_median
@@ -23,8 +22,6 @@ from slam.geometry.se3 import FloatArray
 # largest log of a length over the same by the road or by triangulated points
 _AGREEMENT = 0.25
 _LEAST_ROAD_CORNERS = 8
-# least sigma of the direction of motion, radians
-_AXIS_SIGMA = float(np.deg2rad(8.0))
 _LEAST_COMMON = 12  # points by which two steps compare their lengths
 
 
@@ -84,22 +81,17 @@ def most_credible(
 ) -> Step | None:
     """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
     estimated = [step for step in steps if step is not None]
-    balance = [sum(_votes(step, matches, height_unscaled, seconds, history)) for step in estimated]
+    balance = []
+    for step in estimated:
+        speed = step.speed(height_unscaled, seconds)
+        votes = [history.is_possible_speed(speed, seconds), _fits_ratio(step, speed, history)]
+        votes += [_fits_road(step, matches, height_unscaled), _fits_axis(step, history)]
+        balance.append(sum(1 if vote else -1 for vote in votes if vote is not None))
     best = int(np.argmax(balance))
     return estimated[best] if balance[best] >= 0 else None
 
 
-def _votes(
-    step: Step, matches: Matches, height_unscaled: float | None, seconds: float, history: MotionHistory
-) -> list[int]:
-    """1 for, -1 against, by each measurement that there is."""
-    speed = step.speed(height_unscaled, seconds)
-    votes = [history.is_possible_speed(speed, seconds), _fits_ratio(step, speed, seconds, history)]
-    votes += [_fits_road(step, matches, height_unscaled), _fits_axis(step, history)]
-    return [1 if vote else -1 for vote in votes if vote is not None]
-
-
-def _fits_ratio(step: Step, speed: float, seconds: float, history: MotionHistory) -> bool | None:
+def _fits_ratio(step: Step, speed: float, history: MotionHistory) -> bool | None:
     """Whether points of this step and the one before have the ratio of lengths that learned depth has."""
     if step.motion.length_ratio is None or not history.speeds or not np.isfinite(speed / history.speeds[-1]):
         return None
@@ -109,7 +101,7 @@ def _fits_ratio(step: Step, speed: float, seconds: float, history: MotionHistory
 
 def _fits_axis(step: Step, history: MotionHistory) -> bool | None:
     """Whether the direction is about the median of the last hundred steps, which a few wrong ones do not change."""
-    prior = history.prior(_AXIS_SIGMA)
+    prior = history.prior()
     if not np.isfinite(prior.axis_sigma):
         return None
     cosine = abs(float(prior.axis @ step.two_view.unit_pose.direction))

@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
+from slam.frontend.visual.motion import AXIS_SIGMA, MotionHistory, MotionPrior
 from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry.epipolar import (
@@ -50,7 +50,6 @@ CORNER_CORRELATION = 2.0
 _ALONG_PX = 0.4  # corner noise along the epipolar line, pixels, besides that of learned depth
 _EARLY_EXIT_INLIER_RATIO = 0.75  # inlier ratio at which RANSAC stops early
 INLIER_PX = 0.6  # largest epipolar distance of an inlier, pixels
-_DIRECTION_PRIOR_SIGMA_DEG = 8.0  # least sigma of the motion prior on the translation direction, degrees
 DEPTH_RELATIVE_SIGMA = 0.2  # least relative sigma of learned depth along an epipolar line
 
 
@@ -106,7 +105,7 @@ class TwoViewEstimator:
         reliable = votes & (matches.weights >= _LEAST_PROPOSING_WEIGHT)
         first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
         depth = matches.depth_previous[reliable]
-        prior, least = history.prior(float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG))), _EARLY_EXIT_INLIER_RATIO
+        prior, least = history.prior(), _EARLY_EXIT_INLIER_RATIO
         usual = self._refined(matches, history.last, prior)
         if usual is not None and usual.agreeing[votes].mean() >= least:
             return usual
@@ -130,8 +129,7 @@ class TwoViewEstimator:
         Learned depth has a small weight: it is needed only to choose between motions.
         """
         matches = replace(matches, depth_sigma=_PATCH_WIDENING * matches.depth_sigma)
-        prior = MotionPrior(start.direction, float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
-        return self._refined(matches, start, prior)
+        return self._refined(matches, start, MotionPrior(start.direction, AXIS_SIGMA))
 
     def _residuals(self, matches: Matches) -> Residuals:
         return Residuals(matches.rays_previous, matches.rays_current, matches.depth_previous, self._focal_px)
@@ -190,14 +188,9 @@ class TwoViewEstimator:
         """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
 
         The majority of the parallax in the image decides on the length by which learned depth is compared, not the
-        majority of corners: those far away are many at times, and their depth is the least certain.
-
-        Args:
-            matches: corners.
-            near: whether they are near their lines ``(M,)``.
-            shift_px: shift along them by learned depth ``(M,)``.
-            seen_px: shift along them as it is ``(M,)``.
-            parallax_px: a larger shift is inlier against learned depth.
+        majority of corners: those far away are many at times, and their depth is the least certain. Shifts ``(M,)``
+        along the lines are ``shift_px`` by learned depth and ``seen_px``; larger ones than ``parallax_px`` are inliers
+        against it.
         """
         known = np.isfinite(matches.depth_previous)
         measured = near & known & (seen_px > 1.0) & (shift_px > 0)

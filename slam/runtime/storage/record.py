@@ -12,8 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from erfsfm.common.config_tree import first_problem
 from erfsfm.common.files import read_text
-from slam.runtime.attempt import Failed
-from slam.runtime.errors import RunError
+from slam.runtime.errors import Failed, RunError
 
 NOT_RECORDED = "not recorded"
 

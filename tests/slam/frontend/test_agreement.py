@@ -13,14 +13,13 @@ import pytest
 from erfsfm.common.command_line import Terminal
 from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
-from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
+from slam.frontend.drive import Drive, Segment
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
-from slam.frontend.segments import Segment
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
 from slam.geometry import se3
+from slam.runtime.errors import Failed
 
 FRAMES = 40
 CAMERA = Intrinsics(416, 128, 240.0, 240.0, 207.5, 63.5)
@@ -86,7 +85,7 @@ def driven(
     drive = Drive(
         motions=[Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support) for k, pose in enumerate(poses)],
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
-        roads=[MeasurementFailure("not asked")] * (FRAMES + 1),
+        roads=[Failed("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
     )
     focal_length = FocalLength(1e6, -1e6 * focal)
@@ -137,7 +136,7 @@ def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:
 
 @pytest.mark.parametrize(("is_metric", "is_carried"), [(False, False), (True, True)])
 def test_without_metres_and_of_a_carried_camera_no_number_is_said(is_metric: bool, is_carried: bool) -> None:
-    assert isinstance(agreement.confidence([], is_metric, is_carried), MeasurementFailure)
+    assert isinstance(agreement.confidence([], is_metric, is_carried), Failed)
 
 
 def test_two_contradictions_are_two_warnings(

@@ -6,15 +6,16 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
+from oracle import snippets_of
 
-from slam.frames import Ends, RelativePose, SnippetPoses
+from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.runtime.errors import Failed
 
 FRAMES = 12
 METRES = 4.0  # per unscaled length
@@ -37,17 +38,9 @@ def motions(steps: list[Ends], T: FloatArray) -> list[Motion]:
     return [Motion(pose(*ends, T=T), 0.002**2 * np.eye(6)) for ends in steps]
 
 
-def snippets(T: FloatArray) -> list[SnippetPoses]:
-    found = []
-    for target in range(2, FRAMES - 2):
-        sources = tuple(k for k in range(target - 2, target + 3) if k != target)
-        found.append(SnippetPoses(target, sources, invert(T[list(sources)]) @ T[target]))
-    return found
-
-
 def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
     known = {ends: StepLength(value, 0.02, 0.03) for ends, value in (lengths or {}).items()}
-    return Scale("camera-height", MeasurementFailure("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit")
+    return Scale("camera-height", Failed("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit")
 
 
 def factors(measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = ()) -> list[RelativePose]:
@@ -62,7 +55,7 @@ def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
     interpolated = [pose(7, 8, "interpolated", small)]
     lidar = (pose(3, 4, "lidar"),)  # in metres already
     found = factors(
-        Drive(motions=motions(STEPS, small), trusted=snippets(small), gap_steps=interpolated), scale(), lidar
+        Drive(motions=motions(STEPS, small), trusted=snippets_of(small), gap_steps=interpolated), scale(), lidar
     )
     assert {factor.source for factor in found} == {"essential", "interpolated", "lidar", NETWORK_SOURCE}
     for factor in found:
@@ -89,7 +82,7 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
 
 
 def test_the_network_has_a_factor_on_every_step_that_nothing_else_measures_where_its_unit_is_not_known() -> None:
-    found = factors(Drive(motions=motions(STEPS, TRUE), trusted=snippets(TRUE)), scale())
+    found = factors(Drive(motions=motions(STEPS, TRUE), trusted=snippets_of(TRUE)), scale())
     every = [(k, k + 1) for k in range(FRAMES - 1)]
     assert [f.ends for f in found if f.source == NETWORK_SOURCE] == [ends for ends in every if ends not in STEPS]
 
@@ -118,7 +111,3 @@ def test_odometry_takes_the_step_from_the_nearest_frame_and_the_last_of_these() 
     wrong = drive(3.0)
     mixed = [pose(0, 2, T=wrong), pose(1, 2, T=wrong), pose(1, 2), pose(0, 1), pose(0, 2, T=wrong)]
     np.testing.assert_allclose(chain_odometry(mixed, 3)[2], TRUE[2], atol=1e-9)
-
-
-def test_odometry_without_geometry_is_the_network() -> None:
-    np.testing.assert_allclose(chain_odometry(by_network(), FRAMES), chain(np.tile(T_OF_NETWORK, (FRAMES - 1, 1, 1))))

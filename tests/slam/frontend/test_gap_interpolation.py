@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from oracle import snippets_of
 
-from slam.frames import RelativePose, SnippetPoses
-from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps
+from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses
+from slam.frontend.drive import Drive, Segment
+from slam.frontend.gap_interpolation import (
+    INTERPOLATED_SOURCE,
+    find_cuts,
+    find_segments,
+    interpolate_gaps,
+    join_gap_ends,
+)
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
-from slam.runtime.errors import SlamError
+from slam.graph.pose_graph import PoseGraph
+from slam.runtime.errors import Failed, SlamError
 
 COUNT = 40
 STEP = from_rotation_vector(np.array([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 1.0]))
@@ -25,16 +33,6 @@ def steady(count: int = COUNT) -> FloatArray:
     return chain(np.tile(STEP, (count - 1, 1, 1)))
 
 
-def snippet(T_world_camera: FloatArray, target: int) -> SnippetPoses:
-    sources = tuple(k for k in range(target - 2, target + 3) if k != target)
-    return SnippetPoses(target, sources, invert(T_world_camera[list(sources)]) @ T_world_camera[target])
-
-
-def snippets_of(T_world_camera: FloatArray, unusable: set[int]) -> list[SnippetPoses]:
-    targets = range(2, len(T_world_camera) - 2)
-    return [snippet(T_world_camera, t) for t in targets if not unusable & set(range(t - 2, t + 3))]
-
-
 def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
     T_from_to = invert(T_world_camera[first]) @ T_world_camera[last]
     return Motion(RelativePose(first, last, T_from_to, np.full(6, 0.01), "essential"))
@@ -42,16 +40,16 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
 
 def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
     reasons = dict.fromkeys(unusable, "black")
-    return interpolate_gaps(collected(snippets_of(T_world_camera, unusable), steps, unusable=reasons), 4)
+    return interpolate_gaps(collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4)
 
 
 def collected(snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any) -> Drive:
-    roads = [MeasurementFailure("not drawn")] * COUNT
+    roads = [Failed("not drawn")] * COUNT
     return Drive(snippets=snippets, motions=list(steps), roads=roads, **others)
 
 
 def test_a_drive_without_gaps_stays_as_it_was() -> None:
-    snippets, steps = snippets_of(steady(), set()), [measured(steady(), 3, 4)]
+    snippets, steps = snippets_of(steady()), [measured(steady(), 3, 4)]
     found = interpolate_gaps(collected(snippets, steps), 4)
     assert found.snippets == found.trusted == snippets and found.motions == steps
     assert found.gap_steps == [] and found.interpolated == {}
@@ -79,7 +77,7 @@ def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth()
     steps = [measured(steady(), k, k + 1) for k in (*range(14), *range(26, COUNT - 1))]
     unusable = set(range(17, 23))
     found = interpolate_gaps(
-        collected(snippets_of(short, unusable), steps, unusable=dict.fromkeys(unusable, "black")), 4
+        collected(snippets_of(short, unusable=unusable), steps, unusable=dict.fromkeys(unusable, "black")), 4
     )
     for factor in found.gap_steps:
         np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
@@ -132,7 +130,7 @@ def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
     seen = true.copy()
     seen[15:25] = seen[14]
     steps = [measured(seen, k, k + 1) for k in range(COUNT - 1)]
-    return interpolate_gaps(collected(snippets_of(seen, set()), steps, repeated=list(range(15, 25))), 4), true
+    return interpolate_gaps(collected(snippets_of(seen), steps, repeated=list(range(15, 25))), 4), true
 
 
 def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
@@ -152,7 +150,7 @@ def test_repeated_images_of_a_standing_camera_are_measurements() -> None:
 
 def test_repetition_to_the_end_is_standing_still() -> None:
     still = np.tile(np.eye(4), (COUNT, 1, 1))
-    found = interpolate_gaps(collected(snippets_of(still, set()), repeated=list(range(1, COUNT))), 4)
+    found = interpolate_gaps(collected(snippets_of(still), repeated=list(range(1, COUNT))), 4)
     assert found.interpolated == {} and found.gap_steps == []
 
 
@@ -160,3 +158,68 @@ def test_without_any_snippet_there_is_one_error() -> None:
     reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
     with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"):
         interpolate_gaps(collected([], unusable=reasons), 4)
+
+
+def relative(T_world_camera: FloatArray, first: int, last: int, sigma: float, source: str) -> RelativePose:
+    T = invert(T_world_camera[first]) @ T_world_camera[last]
+    return RelativePose(first, last, T, np.full(6, sigma), source)
+
+
+def test_a_long_gap_ends_where_the_map_says() -> None:
+    """The camera was carried 2 m aside during 30 blank frames; constant velocity knows nothing of that."""
+    count, before, after = 60, 20, 51
+    centres = np.column_stack([0.01 * np.arange(count), np.zeros(count), np.zeros(count)])
+    centres[before:] += [0.0, 2.0, 1.0]
+    truth = from_rotation_vector(np.outer(np.arange(count) >= before, [0.3, 0.8, 0.1]), centres)
+    step = from_rotation_vector(np.zeros(3), np.array([0.01, 0.0, 0.0]))
+    mapped = [*range(before), *range(after + 1, count)]
+    by_map = [relative(truth, a, b, 0.01, KEYFRAME_SOURCE) for a, b in pairwise(mapped)]
+    guesses = [RelativePose(k, k + 1, step, np.full(6, 0.005), INTERPOLATED_SOURCE) for k in range(before - 1, after)]
+    measured = [relative(truth, after, after + 1, 0.01, "essential")]
+    found = join_gap_ends(guesses, measured, by_map, dict.fromkeys(mapped, 0))
+    assert [pose.ends for pose in found] == [pose.ends for pose in guesses]
+    graph = PoseGraph()
+    graph.add_relative(*found, *measured, *by_map)
+    start = np.tile(np.eye(4), (count, 1, 1))
+    for pose in [*found, *measured, *by_map]:
+        start[pose.to_index] = start[pose.from_index] @ pose.T_from_to
+    np.testing.assert_allclose(graph.optimise(start)[mapped], truth[mapped], atol=1e-6)
+
+
+def test_a_gap_between_two_maps_stays_a_guess() -> None:
+    guess = RelativePose(1, 2, np.eye(4), np.ones(6), INTERPOLATED_SOURCE)
+    truth = from_rotation_vector(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
+    by_map = [relative(truth, 0, 1, 0.01, KEYFRAME_SOURCE), relative(truth, 2, 3, 0.01, KEYFRAME_SOURCE)]
+    (found,) = join_gap_ends([guess], [], by_map, {0: 0, 1: 0, 2: 1, 3: 1})
+    assert found is guess
+
+
+STEPS = [(k, k + 1) for k in range(9)]
+
+
+def test_a_single_failed_step_between_measured_ones_is_a_cut() -> None:
+    measured = [ends for ends in STEPS if ends != (4, 5)]
+    assert find_cuts([(4, 5, "no corners")], measured, ()) == [5]
+    assert find_cuts([(4, 5, "no corners")], [*measured, (3, 5)], ()) == [], "a longer step measures across it"
+    assert find_cuts([(4, 5, "no corners")], measured, {5}) == [], "the image is unusable"
+    two = [ends for ends in measured if ends != (5, 6)]
+    assert find_cuts([(4, 5, ""), (5, 6, "")], two, ()) == [], "one bad image fails two steps"
+    assert find_cuts([(3, 5, "")], measured, ()) == []
+
+
+def test_segments_begin_at_cuts_and_after_long_gaps_that_no_map_of_keyframes_relates() -> None:
+    def never(_: int) -> bool:
+        return False
+
+    assert find_segments(10, [], {}, never) == [Segment(0, 9, "")]
+    dark = dict.fromkeys(range(100, 140), "blank")
+    assert find_segments(200, [50], dark, never) == [
+        Segment(0, 49, ""),
+        Segment(50, 99, "it shows another place than the frame before"),
+        Segment(140, 199, "40 frames before it are interpolated: blank"),
+    ]
+    assert len(find_segments(200, [], dict.fromkeys(range(100, 120), "blank"), never)) == 1
+    assert find_segments(200, [50], dark, lambda first: first == 140) == [
+        Segment(0, 49, ""),
+        Segment(50, 199, "it shows another place than the frame before"),
+    ]

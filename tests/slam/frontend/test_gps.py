@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from slam.config.sections import GpsConfig
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gps import fixes_of, scale_by_gps
 from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 SPEED, HZ = 1.4, 10.0
 CONFIG = GpsConfig()
 
 
-def scale(positions: FloatArray, seed: int) -> ScaleEstimate | MeasurementFailure:
+def scale(positions: FloatArray, seed: int) -> ScaleEstimate | Failed:
     """Of an exact walk in metres, with a fix a second whose errors last as long as the configuration says."""
     rng = np.random.default_rng(seed)
     stamps = np.arange(len(positions)) / HZ
@@ -31,7 +31,7 @@ def scale(positions: FloatArray, seed: int) -> ScaleEstimate | MeasurementFailur
     T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
     T_world_camera[:, :3, 3] = positions
     fixes = fixes_of(track, stamps, CONFIG)
-    assert not isinstance(fixes, MeasurementFailure)
+    assert not isinstance(fixes, Failed)
     return scale_by_gps(fixes, T_world_camera, stamps)
 
 
@@ -58,4 +58,4 @@ def test_errors_of_fixes_do_not_lengthen_the_scale(walk: FloatArray) -> None:
 
 def test_a_track_under_the_documented_length_gives_no_scale() -> None:
     found = [scale(straight(112.0), seed) for seed in range(12)]
-    assert all(isinstance(each, MeasurementFailure) and "moves too little" in each.reason for each in found)
+    assert all(isinstance(each, Failed) and "moves too little" in each.reason for each in found)

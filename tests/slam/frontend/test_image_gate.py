@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from slam.frames import Frame, Image
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate
+from slam.runtime.errors import Failed
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -33,7 +33,7 @@ def frames_of(images: list[Image]) -> list[Frame]:
 
 def verdicts(images: list[Image], gate: ImageGate | None = None) -> list[str]:
     gate = gate or ImageGate()
-    return [v.reason if isinstance(v, MeasurementFailure) else v for v in map(gate.check, frames_of(images))]
+    return [v.reason if isinstance(v, Failed) else v for v in map(gate.check, frames_of(images))]
 
 
 def jpeg(image: Image, quality: int) -> Image:
@@ -121,14 +121,6 @@ def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> 
     rng = np.random.default_rng(0)
     noisy = [np.clip(image + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8) for image in images]
     assert set(verdicts([jpeg(image, 60 + k % 28) for k, image in enumerate(noisy)])) == {"new"}
-
-
-def test_a_simulated_stop_is_not_frozen() -> None:
-    drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 208, 64, ("stop",)))
-    steps = np.linalg.norm(np.diff(drive.T_world_camera[:, :3, 3], axis=0), axis=1)
-    assert (steps < 1e-9).sum() >= 10 and (steps > 0.5).sum() >= 10
-    images = [jpeg(drive.render(k).image, 60 + k % 28) for k in range(60)]
-    assert set(verdicts(images)) == {"new"}
 
 
 @pytest.mark.data

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.kitti import read_velodyne
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
+from slam.runtime.errors import Failed
 from slam.sequences.catalogue import open_sequence
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
@@ -86,7 +86,7 @@ def test_without_two_scans_that_can_be_read_the_reason_stands_for_the_path(stree
     for path in sequence.paths.values():
         path.write_bytes(b"12345")
     failure = lidar_path(sequence)
-    assert isinstance(failure, MeasurementFailure)
+    assert isinstance(failure, Failed)
     assert re.search(r"2 of 2 LiDAR scans .*0\.bin is no Velodyne scan.*; got [45] bytes", failure.reason)
 
 

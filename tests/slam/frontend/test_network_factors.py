@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from oracle import snippets_of
 
 from slam.evaluation.coverage import coverage
-from slam.frames import RelativePose, SnippetPoses
+from slam.frames import RelativePose
 from slam.frontend.network_factors import calibrate_network, chain_raw, network_factors, network_steps
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -26,18 +27,6 @@ def drive(count: int) -> np.ndarray:
     return se3.chain(se3.from_rotation_vector(turns[1:], steps[1:]))
 
 
-def snippets_of(T, sources: int = 4, wrong: float = 0.0) -> list[SnippetPoses]:
-    """One per target; every pose but target -> next is shifted by ``wrong``."""
-    half, snippets = sources // 2, []
-    for target in range(half, len(T) - half):
-        indices = tuple(k for k in range(target - half, target + half + 1) if k != target)
-        poses = np.stack([se3.invert(T[k]) @ T[target] for k in indices])
-        for k, pose in zip(indices, poses, strict=True):
-            pose[0, 3] += wrong * (k != target + 1)
-        snippets.append(SnippetPoses(target, indices, poses))
-    return snippets
-
-
 @pytest.mark.parametrize(("count", "sources"), [(5, 4), (6, 4), (30, 4), (3, 2), (20, 2)])
 def test_exact_snippets_chain_to_the_truth(count, sources):
     T = drive(count)
@@ -48,11 +37,14 @@ def test_exact_snippets_chain_to_the_truth(count, sources):
 
 def test_chain_uses_target_to_next_and_nothing_else():
     T = drive(12)
-    chained = chain_raw(snippets_of(T, wrong=0.5), 12)
+    snippets = snippets_of(T)
+    for each in snippets:
+        each.T_source_target[np.array(each.sources) != each.target + 1, 0, 3] += 0.5
+    chained = chain_raw(snippets, 12)
     inner = se3.invert(chained[2:-2]) @ chained[3:-1]
     np.testing.assert_allclose(inner, se3.invert(T[2:-2]) @ T[3:-1], atol=1e-9)
     # the ends come from the direct poses, which are wrong here
-    first, last = snippets_of(T, wrong=0.5)[0], snippets_of(T, wrong=0.5)[-1]
+    first, last = snippets[0], snippets[-1]
     np.testing.assert_allclose(se3.invert(chained[0]) @ chained[2], first.T_source_target[0], atol=1e-9)
     np.testing.assert_allclose(se3.invert(chained[1]) @ chained[2], first.T_source_target[1], atol=1e-9)
     np.testing.assert_allclose(se3.invert(chained[11]) @ chained[9], last.T_source_target[3], atol=1e-9)

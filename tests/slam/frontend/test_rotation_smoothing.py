@@ -72,19 +72,6 @@ def drive(
     return steps, across, truth
 
 
-def test_without_relative_rotations_steps_stay_as_they_were() -> None:
-    steps, _, _ = drive(np.zeros(3), 0.0)
-    assert smooth_rotations(steps, []) is steps
-
-
-def test_true_steps_and_relative_rotations_stay_true() -> None:
-    truth = true_rotations(np.random.default_rng(0))
-    across = [RelativeRotation(k, k + 2, truth[k + 1] @ truth[k], np.full(3, SIGMA)) for k in range(STEPS - 1)]
-    smoothed = rotations_of(smooth_rotations(single(truth), across))
-    for k in range(STEPS):
-        np.testing.assert_allclose(smoothed[k, k + 1], truth[k], atol=1e-12)
-
-
 @pytest.mark.parametrize("axis", range(3))
 def test_a_bias_of_every_measurement_counts_half_as_often_over_two_steps(axis: int) -> None:
     steps, across, truth = drive(SIGMA * np.eye(3)[axis], 0.1 * SIGMA)
@@ -97,23 +84,6 @@ def test_a_relative_rotation_that_is_far_off_is_an_outlier() -> None:
     wrong = Rotation.from_euler("y", 5.0, degrees=True).as_matrix() @ across[10].R_to_from
     across[10] = RelativeRotation(10, 12, wrong, across[10].sigmas)
     assert error_deg(smooth_rotations(steps, across), truth) < before + 0.02
-
-
-def test_relative_rotations_across_a_step_that_was_not_measured_are_not_used() -> None:
-    steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
-    gap = {ends: motion for ends, motion in steps.items() if ends != (20, 21)}
-    smoothed = rotations_of(smooth_rotations(gap, across))
-    assert list(smoothed) == list(gap)
-    elsewhere = [rotation for rotation in across if not rotation.from_index <= 20 < rotation.to_index]
-    assert len(elsewhere) == len(across) - 2
-    for ends, R in rotations_of(smooth_rotations(gap, elsewhere)).items():
-        np.testing.assert_array_equal(R, smoothed[ends])
-
-
-def test_steps_alone_on_both_sides_of_a_gap_are_kept() -> None:
-    steps, across, _ = drive(np.zeros(3), 0.1 * SIGMA)
-    alone = {ends: steps[ends] for ends in ((0, 1), (20, 21))}
-    assert smooth_rotations(alone, across) is alone
 
 
 def test_steps_that_are_not_triangulated_stay_and_are_not_crossed() -> None:

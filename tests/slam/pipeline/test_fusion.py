@@ -10,10 +10,10 @@ import pytest
 from erfsfm.mvs.fusion import DepthFusion
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.fusion import keyframe_depths
+from slam.runtime.errors import Failed
 from slam.runtime.storage.spill import SpillFile
 
 CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
@@ -27,7 +27,7 @@ def depths(step: float, guess_sigma: float | None, refined: bool = True) -> Call
     wall = np.full((32, 64), 2.5, np.float32)
     drive = Drive(
         keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames],
-        roads=[MeasurementFailure("no road")] * FRAMES,
+        roads=[Failed("no road")] * FRAMES,
     )
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)

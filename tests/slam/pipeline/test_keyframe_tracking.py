@@ -11,7 +11,6 @@ from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.scale.road_plane import GroundPlane
@@ -19,6 +18,7 @@ from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
 from slam.pipeline.observer import Observer
+from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch
 
 
@@ -45,7 +45,7 @@ def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
 ) -> None:
     drive = steps(count, scatter, seconds)
     assert choose(KeyframesConfig(), None, drive) == front_end
-    drive.roads[:] = [MeasurementFailure("no road")] * count
+    drive.roads[:] = [Failed("no road")] * count
     assert choose(KeyframesConfig(), None, drive) != "steps"
 
 
@@ -64,8 +64,8 @@ KEYFRAMES_ALONE = SlamConfig(
 
 
 def completed(observer: Observer) -> Drive:
-    found = observer.observations()
-    return complete_drive(found.drive, 4, found.maps, keyframe_poses(found.maps, room.INTRINSICS))
+    drive = observer.observations().drive
+    return complete_drive(drive, 4, keyframe_poses(drive.maps, room.INTRINSICS))
 
 
 @pytest.mark.parametrize("stands", [False, True])
@@ -132,12 +132,12 @@ def test_observations_stay_while_frames_follow() -> None:
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k in range(26):
             observer.add(k, room.frame(k, truth[k]))
-        found = observer.observations()
-        before = pickle.dumps((found.drive, found.maps, found.events))
+        drive = observer.observations().drive
+        before = pickle.dumps(drive)
         for k in range(26, 40):
             observer.add(k, room.frame(k, truth[k]))
         assert len(observer.observations().drive) == 40
-    assert found.maps and pickle.dumps((found.drive, found.maps, found.events)) == before
+    assert drive.maps and drive.events and pickle.dumps(drive) == before
 
 
 def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:

@@ -12,7 +12,7 @@ from slam.config.sections import KeyframesConfig, SlamConfig
 from slam.frames import LOOP_SOURCE, RelativePose, View
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.odometry import KeyframeOdometry
-from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
+from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.loops.closure import LoopClosures, find_loops
 from slam.loops.consistency import Track
@@ -51,9 +51,7 @@ def errors(found: KeyframePoses, truth: FloatArray) -> tuple[float, float]:
     """Of the last map: root mean square of aligned positions, largest of rotations since its first frame in degrees."""
     last = max(found.segments.values())
     poses = [pose for pose in found.poses if found.segments[pose.to_index] == last]
-    T = {poses[0].from_index: np.eye(4)}
-    for pose in sorted(poses, key=lambda pose: pose.to_index):
-        T[pose.to_index] = T[pose.from_index] @ pose.T_from_to
+    T = chained(poses)
     frames = sorted(T)
     estimate, true = np.stack([T[k] for k in frames]), truth[frames]
     similarity = umeyama(true[:, :3, 3], estimate[:, :3, 3], with_scale=True)

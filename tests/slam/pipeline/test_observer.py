@@ -16,6 +16,7 @@ from oracle import OracleNoise, OraclePredictor
 from slam.config.sections import SlamConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
+from slam.frontend import tracking
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.geometry.se3 import FloatArray
@@ -101,7 +102,7 @@ def street() -> SimulatedSequence:
 def close_corners() -> Iterator[None]:
     """Images of the test are small."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("slam.frontend.tracking.CORNER_SPACING_PX", 4.0)
+        patch.setattr(tracking, "STEP_CORNERS", tracking.STEP_CORNERS._replace(spacing_px=4.0))
         yield
 
 

@@ -8,14 +8,13 @@ from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
 from slam.frames import Image, Intrinsics
-from slam.frontend.failure import MeasurementFailure
 from slam.geometry import se3
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.pipeline.run import SlamPipeline
-from slam.runtime.errors import ConfigError, SlamError
+from slam.runtime.errors import ConfigError, Failed, SlamError
 from slam.sequences.recording import RecordedSequence
 
 FRAMES = 200
@@ -113,7 +112,7 @@ def test_fixes_of_another_drive_are_left_out_or_refused(change: str, caplog: pyt
     settings = ("gps.sigma_m=0.2", "gps.vertical_sigma_m=0.2")
     result = run(other, *settings, "scale.mode=reference")
     found = next(each for each in result.agreements if each.source == "GPS")
-    assert found.is_wrong and isinstance(result.location, MeasurementFailure)
+    assert found.is_wrong and isinstance(result.location, Failed)
     assert caplog.text.count("GPS contradicts the images by") == 1
     with pytest.raises(SlamError, match="contradicts the images by"):
         run(other, *settings, "scale.mode=gps")
@@ -122,15 +121,15 @@ def test_fixes_of_another_drive_are_left_out_or_refused(change: str, caplog: pyt
 def test_a_camera_that_stands_is_not_located() -> None:
     gps = track(np.random.default_rng(0), 0.0)
     result = run(GpsTrack(gps.stamps, np.tile(PLACE, (len(gps.stamps), 1)), gps.dilution))
-    assert isinstance(result.location, MeasurementFailure) and "moves too little" in result.location.reason
-    assert isinstance(result.scale.estimate, MeasurementFailure)
+    assert isinstance(result.location, Failed) and "moves too little" in result.location.reason
+    assert isinstance(result.scale.estimate, Failed)
 
 
 def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(caplog: pytest.LogCaptureFixture) -> None:
     """Long enough for the heading, too short for the scale."""
     gps = track(np.random.default_rng(0), 0.0)
     result = run(gps, "gps.sigma_m=5", "gps.correlation_s=0")
-    assert isinstance(result.location, MeasurementFailure)
+    assert isinstance(result.location, Failed)
     assert "0 stretches of a tenth of the fixes span over 25.0 m" in result.location.reason
     assert caplog.text.count("the camera moves too little") == 1
     assert result.optimised.length_m == pytest.approx(result.odometry.length_m, rel=1e-6)

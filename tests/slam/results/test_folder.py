@@ -12,8 +12,7 @@ import pytest
 import slam
 from slam.results.folder import RunFolder
 from slam.results.metrics import MapMetrics, Metrics, Provenance
-from slam.runtime.attempt import Failed
-from slam.runtime.errors import RunError
+from slam.runtime.errors import Failed, RunError
 
 MakeRun = Callable[..., RunFolder]
 

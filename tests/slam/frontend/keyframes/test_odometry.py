@@ -5,29 +5,21 @@ import numpy as np
 import pytest
 import room
 
-from slam.frames import KEYFRAME_SOURCE, Intrinsics
-from slam.frontend.keyframes.local_map import LocalMap, TrackIds
+from slam.frames import KEYFRAME_SOURCE
 from slam.frontend.keyframes.odometry import KeyframeOdometry
-from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
+from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
+from slam.geometry.se3 import from_rotation_vector, invert, rotation_angle, umeyama
 
 
 def poses(state: KeyframeOdometry) -> KeyframePoses:
     return keyframe_poses(state.segments, room.INTRINSICS)
 
 
-def chained(found: KeyframePoses) -> dict[int, FloatArray]:
-    T = {found.poses[0].from_index: np.eye(4)}
-    for pose in found.poses:
-        T[pose.to_index] = T[pose.from_index] @ pose.T_from_to
-    return T
-
-
 def test_a_hand_held_camera_is_followed() -> None:
     truth = room.walk(70)
     state = room.tracked(truth)
     found = poses(state)
-    T = chained(found)
+    T = chained(found.poses)
     assert sorted(T) == list(range(70))
     assert {pose.source for pose in found.poses} == {KEYFRAME_SOURCE}
     assert 4 <= len(state.segments[0].map.keyframes) <= 30
@@ -50,7 +42,7 @@ def test_a_map_begins_on_a_plane(seed: int) -> None:
     for k, T_world_camera in enumerate(truth):
         odometry.follow(room.frame(k, T_world_camera, near=False))
         odometry.learn(room.frame(k, T_world_camera, near=False), room.depth_map(T_world_camera))
-    T = chained(poses(odometry))
+    T = chained(poses(odometry).poses)
     estimate = np.stack([T[k] for k in range(50)])
     estimate = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True).apply_to_poses(estimate)
     turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
@@ -62,7 +54,7 @@ def test_without_parallax_the_camera_has_its_turn_and_stays(motion: str) -> None
     truth = room.walk(25, step_m=0.0, turn=0.004)
     if motion == "standing":
         truth[:] = np.eye(4)
-    T = chained(poses(room.tracked(truth)))
+    T = chained(poses(room.tracked(truth)).poses)
     assert sorted(T) == list(range(25))
     estimate = np.stack([T[k] for k in range(25)])
     turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
@@ -75,7 +67,7 @@ def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
     state = room.tracked(np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
     keyframes = state.segments[0].map.keyframes
     assert keyframes[-1].index <= 31
-    T = chained(poses(state))
+    T = chained(poses(state).poses)
     stood = np.linalg.norm(np.stack([T[k][:3, 3] - T[32][:3, 3] for k in range(32, 55)]), axis=1)
     travelled = np.linalg.norm(T[29][:3, 3])
     assert stood.max() < 0.005 * travelled
@@ -125,7 +117,7 @@ def test_a_short_move_has_its_length_by_learned_depth() -> None:
         view = room.frame(k, T, near=False)
         odometry.follow(view)
         odometry.learn(view, room.depth_map(T))
-    T = chained(poses(odometry))
+    T = chained(poses(odometry).poses)
     np.testing.assert_allclose(T[4][:3, 3], [0.08, 0.0, 0.0], atol=0.02)
 
 
@@ -141,26 +133,7 @@ def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn() -> None:
         odometry.follow(view)
         odometry.learn(view, room.depth_map(T))
     assert [event.event for event in odometry.events] == ["map begun"]
-    T = chained(poses(odometry))
+    T = chained(poses(odometry).poses)
     assert sorted(T) == list(range(len(truth)))
     turned = rotation_angle(np.stack([T[k][:3, :3].T @ truth[k, :3, :3] for k in range(len(truth))]))
     assert np.rad2deg(turned).max() < 3.1
-
-
-def test_the_newest_keyframe_keeps_the_pose_of_its_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
-    adjusted: dict[int, FloatArray] = {}
-    adjust = LocalMap.adjust
-
-    def recorded(local: LocalMap, intrinsics: Intrinsics) -> TrackIds:
-        gone = adjust(local, intrinsics)
-        adjusted[local.keyframes[-1].index] = local.keyframes[-1].T_camera_world
-        return gone
-
-    monkeypatch.setattr(LocalMap, "adjust", recorded)
-    odometry = KeyframeOdometry(room.INTRINSICS)
-    for k, T in enumerate(room.walk(30)):
-        odometry.follow(room.frame(k, T))
-        odometry.learn(room.frame(k, T), room.depth_map(T))
-        newest = odometry.segments[-1].map.keyframes[-1]
-        np.testing.assert_array_equal(newest.T_camera_world, adjusted.get(newest.index, newest.T_camera_world))
-    assert len(adjusted) > 3

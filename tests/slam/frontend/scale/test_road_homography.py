@@ -8,10 +8,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from slam.frames import Frame, Intrinsics
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale import road_homography
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.geometry import se3
+from slam.runtime.errors import Failed
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 HEIGHT_M = 1.65
@@ -53,7 +53,7 @@ def pitched(pitch_deg: float) -> np.ndarray:
     return se3.from_rotation_vector(np.deg2rad([pitch_deg, 0.0, 0.0]), np.zeros(3))
 
 
-def measure(texture, step: np.ndarray, pitch_deg: float = 0.0, car_ahead=False) -> RoadStep | MeasurementFailure:
+def measure(texture, step: np.ndarray, pitch_deg: float = 0.0, car_ahead=False) -> RoadStep | Failed:
     """One step of a camera that looks down by ``pitch_deg``; only the direction of its motion is given."""
     T_body_camera = pitched(-pitch_deg)
     previous = render(T_body_camera, texture, 0, car_ahead)
@@ -97,7 +97,7 @@ def test_a_car_that_covers_the_road_is_refused(texture):
     """All that the strip shows far ahead drives as fast as the camera, and below it the road is even."""
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     failure = RoadHomography(CAMERA).measure(*behind_a_car(texture, rows=90), step)
-    assert isinstance(failure, MeasurementFailure) and "stands still" in failure.reason
+    assert isinstance(failure, Failed) and "stands still" in failure.reason
 
 
 def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture, monkeypatch):
@@ -108,7 +108,7 @@ def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(textu
     assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.1)
     assert road.relative_sigma >= 0.1
     monkeypatch.setattr(road_homography, "_SHAPES", (road_homography._SHAPES[0], (0.1, 2.0, 0.1)))
-    assert isinstance(RoadHomography(CAMERA).measure(*frames, step), MeasurementFailure)
+    assert isinstance(RoadHomography(CAMERA).measure(*frames, step), Failed)
 
 
 def test_what_is_no_road_is_refused_with_a_reason(texture, monkeypatch):
@@ -116,14 +116,14 @@ def test_what_is_no_road_is_refused_with_a_reason(texture, monkeypatch):
     rng = np.random.default_rng(0)
     noise = [Frame(k, 0.0, rng.integers(0, 255, (188, 620, 3), np.uint8)) for k in range(2)]
     failure = RoadHomography(CAMERA).measure(*noise, step)
-    assert isinstance(failure, MeasurementFailure) and "do not correlate" in failure.reason
+    assert isinstance(failure, Failed) and "do not correlate" in failure.reason
     sky = Intrinsics(620, 188, 360.0, 360.0, 303.0, 180.0)
     failure = RoadHomography(sky).measure(*noise, step)
-    assert isinstance(failure, MeasurementFailure) and "too little of the road" in failure.reason
+    assert isinstance(failure, Failed) and "too little of the road" in failure.reason
     monkeypatch.setattr(road_homography, "_MAX_TILT_DEG", 0.01)
     monkeypatch.setattr(road_homography, "_TILT_SIGMA_DEG", 5.0)
     failure = measure(texture, step, pitch_deg=3.0)
-    assert isinstance(failure, MeasurementFailure) and "tilted" in failure.reason
+    assert isinstance(failure, Failed) and "tilted" in failure.reason
 
 
 def test_a_camera_that_looks_down_learns_its_pitch(texture):

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from slam.frames import DepthMap, Intrinsics
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
 from slam.frontend.scale.scale_estimate import ScaleEstimate, scale_from_road
 from slam.frontend.visual.depth_error import DepthError
+from slam.runtime.errors import Failed
 
 CAMERA = Intrinsics(416, 128, 240.0, 240.0, 207.5, 63.5)
 HEIGHT = 0.37
 
 
-def fit_ground_plane(depth: DepthMap, seed: int = 0) -> GroundPlane | MeasurementFailure:
+def fit_ground_plane(depth: DepthMap, seed: int = 0) -> GroundPlane | Failed:
     return GroundPlaneFitter(CAMERA, seed).fit(depth, DepthError())
 
 
@@ -66,7 +66,7 @@ def test_unknown_depth_is_left_out(unknown):
     assert isinstance(road, GroundPlane) and road.inlier_ratio == 1.0
     assert road.height_unscaled == pytest.approx(HEIGHT, rel=1e-4)
     depth[:] = unknown
-    assert isinstance(fit_ground_plane(depth), MeasurementFailure)
+    assert isinstance(fit_ground_plane(depth), Failed)
 
 
 def test_a_car_ahead_does_not_move_the_road():
@@ -99,5 +99,5 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same():
 )
 def test_what_is_no_road_is_refused_with_a_reason(depth, reason):
     failure = fit_ground_plane(depth)
-    assert isinstance(failure, MeasurementFailure)
+    assert isinstance(failure, Failed)
     assert re.search(reason, failure.reason)

@@ -40,12 +40,6 @@ def test_jitter_is_the_residual_to_a_smooth_motion():
     assert rotation_jitter(rotations(np.zeros(3))).max() < 1e-5
 
 
-def test_a_few_jumps_do_not_change_the_jitter_of_a_drive():
-    jittery = turns(np.array([1e-3, 1e-3, 1e-3]))
-    jittery[::50] += 0.1
-    np.testing.assert_allclose(rotation_jitter(dict(enumerate(jittery))), 1e-3, rtol=0.4)
-
-
 def test_gaps_are_left_out_and_few_steps_have_no_jitter():
     drive = rotations(np.full(3, 1e-3))
     np.testing.assert_allclose(rotation_jitter({k: r for k, r in drive.items() if k % 40 != 7}), 1e-3, rtol=0.3)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from slam.frames import Frame, Intrinsics
-from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.motion import Motion, MotionHistory
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, TwoViewEstimator
 from slam.geometry import se3
@@ -108,18 +107,6 @@ def test_a_known_motion_is_refined():
     refined = TwoViewEstimator(FOCAL_PX).refined(matches, start)
     assert refined is not None
     assert angle_deg(refined.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.06
-
-
-def test_the_estimator_has_no_state():
-    """A step whose history is not kept changes no later one."""
-    estimator = TwoViewEstimator(FOCAL_PX)
-    first, second = (corner_with_a_car(seed)[0] for seed in (0, 1))
-    alone = estimator.estimate(second, NO_HISTORY)
-    estimator.estimate(first, NO_HISTORY)
-    again = estimator.estimate(second, NO_HISTORY)
-    assert alone is not None and again is not None
-    np.testing.assert_array_equal(alone.unit_pose.R_current_previous, again.unit_pose.R_current_previous)
-    np.testing.assert_array_equal(alone.inliers, again.inliers)
 
 
 def test_the_history_of_a_drive_chooses_between_motions():

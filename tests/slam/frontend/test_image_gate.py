@@ -123,6 +123,14 @@ def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> 
     assert set(verdicts([jpeg(image, 60 + k % 28) for k, image in enumerate(noisy)])) == {"new"}
 
 
+def test_a_simulated_stop_is_not_frozen() -> None:
+    drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 208, 64, ("stop",)))
+    steps = np.linalg.norm(np.diff(drive.T_world_camera[:, :3, 3], axis=0), axis=1)
+    assert (steps < 1e-9).sum() >= 10 and (steps > 0.5).sum() >= 10
+    images = [jpeg(drive.render(k).image, 60 + k % 28) for k in range(60)]
+    assert set(verdicts(images)) == {"new"}
+
+
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["00", "02", "05"])
 def test_freezes_are_detected_on_real_frames(data_root, name: str) -> None:

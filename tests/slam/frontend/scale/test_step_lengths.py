@@ -156,6 +156,32 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.Monk
     assert np.sqrt(np.square(alone).mean()) > 1.5
 
 
+def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in the middle of a gap of the road, where there are only triangulation and learned depth."""
+    monkeypatch.setattr("slam.frontend.scale.step_lengths.OUTLIER_SIGMAS", 1e9)
+    errors, sigmas = [], []
+    for seed in range(20):
+        road = noisy(0.06, seed=100 + seed)
+        road[60:100] = np.nan
+        rng = np.random.default_rng(seed)
+        chained = np.full(STEPS, np.nan)
+        chained[1:] = np.diff(np.log(TRUE)) + 0.01 * rng.normal(size=STEPS - 1)
+        measured = evidence(
+            absolute=road,
+            absolute_sigma=np.full(STEPS, 0.06),
+            ratio=chained,
+            ratio_sigma=np.full(STEPS, 0.01 / RATIO_WIDENING),
+            learned=noisy(0.1, seed=200 + seed),
+        )
+        solved = solve_lengths(measured)
+        errors.append(np.log(solved.length / TRUE))
+        sigmas.append(solved.relative_sigma)
+    ratio = np.abs(errors) / np.array(sigmas)
+    assert 0.75 < np.sqrt((ratio**2).mean()) < 1.25
+    assert 0.75 < np.sqrt((ratio[:, 70:90] ** 2).mean()) < 1.25
+    assert np.mean(sigmas, axis=0)[80] > 1.5 * np.mean(sigmas, axis=0)[30]
+
+
 def driven(metres: np.ndarray) -> StepEvidence:
     """Steps of a tenth of a second, their lengths by learned depth alone."""
     links = [(k, k + 1) for k in range(len(metres))]

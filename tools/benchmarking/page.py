@@ -13,8 +13,7 @@ import numpy as np
 from benchmarking import handheld
 from benchmarking import metrics as m
 from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, kind, over_seeds, table, values, weights
-from benchmarking.plan import EVERYTHING
-from benchmarking.work import FALSE_DEG, FALSE_M, JobResult
+from benchmarking.runs import EVERYTHING, FALSE_DEG, FALSE_M, JobResult, revision
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -135,14 +134,13 @@ def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition])
 
 def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: str) -> str:
     """A section of the page: command, commit and seeds, then its tables."""
-    commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in results))
     seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
     failed = sum(bool(o.reason) for o in results)
     return f"""## {mode.capitalize()}
 
     {command}
 
-Commit {commits}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_time} at a time on
+Commit {revision()}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_time} at a time on
 {os.cpu_count()} {platform.machine()} cores.
 
 {TABLES[mode](results)}
@@ -223,7 +221,7 @@ def draw(results: Sequence[JobResult], path: Path) -> None:
     figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
     panels = figure.subfigures(rows, columns, squeeze=False).flat
     for o, panel in zip(chosen, panels):
-        axes = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
+        axes = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place)), "")
         legend = axes.get_legend()
         if legend is not None:
             legend.remove()

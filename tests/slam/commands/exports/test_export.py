@@ -73,7 +73,6 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
         ("occupancy", "out.png", "z", r"written as \.yaml or \.pgm"),
         ("nerfstudio", "file", "z", "is a file: a scene is several files"),
         ("mesh", "folder.ply", "y-down", "is a folder"),
-        ("video", "out.mp4", "y-down", "one of mesh, cloud, colmap, nerfstudio, occupancy"),
         ("cloud", "file/out.ply", "y-down", "cannot be written"),
     ],
 )

@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live.reader import Reader
-from slam.commands.live.run import LiveRequest, run_live
+from slam.commands.live.run import LiveRequest, StreamedSequence, run_live
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
+from slam.sequences.camera_file import explicit_camera
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
 FRAMES = 14
@@ -230,35 +230,44 @@ class Scripted:
             raise SequenceError("the cable was pulled")
 
 
+def streamed(source: Scripted, wait_s: float = 60.0, every_frame: bool = False) -> StreamedSequence:
+    camera = explicit_camera(Path("fov=70"), source)
+    return StreamedSequence("scripted", source, camera, wait_s, every_frame)
+
+
 def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
     """While we are busy with the first of 51 images, all others come; the last two of them wait."""
     first_is_taken = Event()
     source = Scripted(51, lambda number: number and first_is_taken.wait())
-    reader, taken = Reader(source, 60.0, lambda image: image), []
-    for arrival in reader:
-        taken.append(int(arrival.image[0, 0, 0]))
+    sequence, taken = streamed(source), []
+    for frame in sequence.frames():
+        taken.append(int(frame.image[0, 0, 0]))
         first_is_taken.set()
         source.is_over.wait()
-    assert taken == [0, 49, 50] and reader.dropped == 48 and reader.ended == "the source ended"
+    assert taken == [0, 49, 50] and sequence.dropped == 48 and sequence.ended == "the source ended"
 
 
 def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:
-    reader = Reader(Scripted(20, lambda number: None), 60.0, lambda image: image, every_frame=True)
-    taken = []
-    for arrival in reader:
-        taken.append(int(arrival.image[0, 0, 0]))
+    source = Scripted(20, lambda number: None)
+    source.is_stored = True
+    sequence, taken = streamed(source, every_frame=True), []
+    for frame in sequence.frames():
+        taken.append(int(frame.image[0, 0, 0]))
         time.sleep(0.001)
-    assert taken == list(range(20)) and reader.dropped == 0 and reader.ended == "the source ended"
+    assert taken == list(range(20)) and sequence.dropped == 0 and sequence.ended == "the source ended"
 
 
 def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
     released = Event()
-    stalls = Reader(Scripted(2, lambda number: number and released.wait()), 0.2, lambda image: image)
-    assert len(list(stalls)) == 1 and stalls.ended == "nothing came for 0.2 s"
+    stalls = streamed(Scripted(2, lambda number: number and released.wait()), 0.2)
+    assert len(list(stalls.frames())) == 1 and stalls.ended == "nothing came for 0.2 s"
     released.set()
     first_is_taken = Event()
-    dies = Reader(Scripted(2, lambda number: number and first_is_taken.wait(), dies=True), 60.0, lambda image: image)
-    assert len([first_is_taken.set() for _ in dies]) == 2 and dies.ended == "the source died: the cable was pulled"
+    dies = streamed(Scripted(2, lambda number: number and first_is_taken.wait(), dies=True))
+    assert (
+        len([first_is_taken.set() for _ in dies.frames()]) == 2
+        and dies.ended == "the source died: the cable was pulled"
+    )
 
 
 @pytest.fixture

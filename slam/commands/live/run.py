@@ -231,8 +231,8 @@ class LiveRecorder(FolderRecorder):
             index, self._said = self._said, self._said + 1
             at_s = sequence.arrived_s.get(index)
             support = None if newest.support is None else round(newest.support, 2)
-            message: dict[str, Any] = {"type": "pose", "frame": index, "stamp": float(sequence.stamps[index]), "state": newest.state}
-            message |= {"unit": self._poses.unit_name, "scale": newest.unit, "support": support}
+            message: dict[str, Any] = {"type": "pose", "frame": index, "stamp": float(sequence.stamps[index])}
+            message |= {"state": newest.state, "unit": self._poses.unit_name, "scale": newest.unit, "support": support}
             message |= {"T_world_camera": newest.T_world_camera[:3].ravel().tolist()}  # row by row as in KITTI's files
             late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
             self._emit(message | {"latency_ms": late_ms, "dropped": sequence.dropped})
@@ -243,7 +243,8 @@ class LiveRecorder(FolderRecorder):
         """Also say all poses again as the whole drive gives them, and why it ended."""
         super().estimate(estimate)
         sequence, trajectory, loops = self._sequence, estimate.optimised, len(estimate.loops.accepted)
-        message: dict[str, Any] = {"type": "trajectory", "state": "loop closed" if loops else "whole drive", "loops": loops}
+        state = "loop closed" if loops else "whole drive"
+        message: dict[str, Any] = {"type": "trajectory", "state": state, "loops": loops}
         message |= {"unit": estimate.scale.unit_name, "run": str(self.folder.path)}
         poses = trajectory.T_world_camera[:, :3].reshape(-1, 12).tolist()
         message |= {"stamps": trajectory.stamps.tolist(), "T_world_camera": poses}

@@ -29,7 +29,6 @@ from benchmarking.metrics import rows
 from shared.command import one_line_errors, parser_of
 
 from erfsfm.common.table import csv_of
-from slam.commands.cluster import workers
 from slam.runtime.storage.files import write_atomically
 
 
@@ -68,8 +67,7 @@ def main(words: Sequence[str] | None = None) -> None:
     jobs = _jobs(options)
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or a recording; see --help")
-    with workers(options.jobs, options.scheduler, (p,)) as spread:  # elsewhere they have no such module
-        results = p.measured(jobs, spread)
+    results = p.measured(jobs, options.jobs, options.scheduler)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
     content = csv_of(table_of_runs).encode()
     write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(content))

@@ -14,10 +14,10 @@ from benchmarking import handheld
 from benchmarking import metrics as m
 from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, kind, over_seeds, table, values, weights
 from benchmarking.runs import EVERYTHING, FALSE_DEG, FALSE_M, JobResult, revision
+from make_figures import draw_trajectories, trajectories_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-from shared.pictures import draw_trajectories, trajectories_of
 
 from erfsfm.common.table import DASH
 from slam.results.folder import RunFolder

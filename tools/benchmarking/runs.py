@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -15,8 +15,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from erfsfm.common.processes import slam_process
-from slam.commands.batch import Drive, run_drive
-from slam.commands.cluster import Spread
+from erfsfm.common.progress import progress_bar
+from slam.commands.batch import Drive, run_drives
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
@@ -173,40 +173,32 @@ def raw_drives(folders: Sequence[Path]) -> list[BenchmarkSequence]:
     return [BenchmarkSequence(folder.name, folder.resolve(), sequence="", kind="KITTI raw") for folder in folders]
 
 
-def measured(jobs: Sequence[Job], spread: Spread) -> list[JobResult]:
-    """Make the worlds that are missing, run what was not run before.
+def measured(jobs: Sequence[Job], count: int, scheduler: str | None) -> list[JobResult]:
+    """Make the worlds that are missing and run what was not run before, ``count`` at a time or by a Dask scheduler.
 
     Raises:
         SystemExit: a world could not be made.
     """
-    drives = {job.drive.root: job.drive for job in jobs if job.drive.simulate}
-    for _, ended in spread(make, list(drives.values())):
-        if isinstance(ended, Exception):
-            raise ended
-    missing = [drive.name for drive in drives.values() if not drive.root.is_dir()]
+    simulated_drives = {job.drive.root: job.drive for job in jobs if job.drive.simulate}
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(make, simulated_drives.values()))
+    missing = [drive.name for drive in simulated_drives.values() if not drive.root.is_dir()]
     if missing:
         raise SystemExit(f"could not be simulated: {', '.join(missing)}")
-    results: dict[int, JobResult] = {}
-    for number, ended in spread(perform, jobs):
-        if isinstance(ended, Exception):
-            raise ended
-        results[number] = ended
-        print(f"{len(results)} of {len(jobs)} runs", file=sys.stderr)
-    return [results[number] for number in range(len(jobs))]
+    drives = [Drive(job.place.name, ROOT, job.arguments) for job in jobs]
+    with progress_bar() as progress:
+        outcomes = run_drives(drives, jobs[0].folder, count, scheduler, progress)
+    for job in jobs:
+        for name in BULKY:
+            (job.place / name).unlink(missing_ok=True)
+    metrics = [Metrics() if each.reason else RunFolder(each.folder).metrics() for each in outcomes]
+    return [JobResult(job, found, each.reason) for job, found, each in zip(jobs, metrics, outcomes)]
 
 
 def make(drive: BenchmarkSequence) -> None:
     """Simulate a world where it is missing."""
     if not drive.root.exists():
         slam_process(["simulate", str(drive.root), *drive.simulate])
-
-
-def perform(job: Job) -> JobResult:
-    """Run a job, unless the same one was successful before."""
-    outcome = run_drive(Drive(job.place.name, ROOT, job.arguments), job.folder)
-    for name in BULKY:
-        (job.place / name).unlink(missing_ok=True)
-    return JobResult(job, Metrics() if outcome.reason else RunFolder(job.place).metrics(), outcome.reason)
 
 
 def revision(checkout: Path = ROOT) -> str:

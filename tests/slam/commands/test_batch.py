@@ -17,9 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from slam.commands.batch import check_output, drives_of, run_drive, run_drives
+from slam.commands.batch import check_output, drives_of, run_drive, run_drives, workers
 from slam.commands.cli import main
-from slam.commands.cluster import workers
 from slam.runtime.errors import RunError, SequenceError
 
 CommandLine = Callable[..., tuple[int, str, str]]

@@ -100,7 +100,7 @@ def export(
         trajectory = _trajectory(folder, up)
         cloud = _map(folder, "cloud", up) if (folder.path / MAP_CLOUD).is_file() else None
         without = _interpolated(folder)
-        has_images = what == "nerfstudio" or dataset is not None or not folder.metrics().provenance.recording.absent
+        has_images = what == "nerfstudio" or dataset is not None or folder.metrics().provenance.recording is not None
         if has_images:
             camera, written = _write_images(folder, output, trajectory, dataset, progress)
             without = set(range(len(trajectory))) - set(written)
@@ -240,14 +240,14 @@ def _image_name(frame: int) -> str:
 def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:
     """The recording of a run, and which frame of it, by its stamp, each row of the trajectory is."""
     recorded = folder.metrics().provenance.recording
-    if recorded.absent and dataset is None:
+    if recorded is None and dataset is None:
         raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
-    place = dataset or (None if recorded.dataset is None else Path(recorded.dataset))
-    camera = None if recorded.camera is None else Path(recorded.camera)
+    recorded = recorded or {}
+    place, camera = (Path(recorded[name]) if name in recorded else None for name in ("dataset", "camera"))
     if dataset is not None and camera is not None and not (camera.exists() or is_field_of_view(camera)):
         camera = None  # it may have moved with the images
     try:
-        sequence = open_sequence(place, recorded.sequence, camera)
+        sequence = open_sequence(dataset or place, recorded.get("sequence"), camera)
     except (SlamError, ErfsfmError) as error:
         raise RunError(
             f"the images of {folder.path} are needed and not found ({error}); give --dataset ROOT"

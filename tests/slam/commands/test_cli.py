@@ -297,7 +297,7 @@ def test_doctor(call: Call, kitti_root: Path) -> None:
 
 def test_a_request_names_its_recording(tmp_path: Path) -> None:
     given = RunRequest.of(dataset=str(tmp_path), camera="fov=70", frames="0:9")
-    assert given.recording.tree() == {"dataset": str(tmp_path), "camera": "fov=70", "frames": "0:9"}
+    assert given.recording == {"dataset": str(tmp_path), "camera": "fov=70", "frames": "0:9"}
 
 
 @pytest.mark.parametrize("seed", [-1, 2**31, "many"])

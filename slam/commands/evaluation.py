@@ -17,8 +17,7 @@ from erfsfm.common.table import Table, csv_of
 from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, evo_commands, exceeded, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
-from slam.results.folder import RunFolder
-from slam.results.output import check_replaced
+from slam.results.folder import RunFolder, check_replaced
 from slam.results.tables import (
     COLUMNS,
     UNITS,

@@ -26,9 +26,8 @@ from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places
 from slam.loops.structure import PlaceStructure
 from slam.loops.verification import OF_KEYFRAMES
-from slam.results.folder import RunFolder
+from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
-from slam.results.output import check_replaced
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES
 from slam.runtime.storage.files import write_atomically

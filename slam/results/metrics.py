@@ -18,7 +18,7 @@ NO_UNIT = "no metric unit"
 
 
 class Provenance(Record):
-    """Version, command, weights and their training data, where depth comes from, the options that name the recording."""
+    """Version, command, weights and their training data, where depth comes from, options that name the recording."""
 
     version: str | None = None
     commit: str | None = None

@@ -31,8 +31,7 @@ from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.prediction.assembly import open_prediction
-from slam.results.folder import RunFolder
-from slam.results.output import check_output
+from slam.results.folder import RunFolder, check_output
 from slam.results.run_log import run_log
 from slam.runtime.errors import SequenceError, SlamError
 from slam.runtime.imports import import_extra

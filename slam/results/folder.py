@@ -60,9 +60,8 @@ class RunFolder:
                 lock.take(output)
             check_output(output)
             output.mkdir(parents=True, exist_ok=True)
-            for path in sorted(
-                output.iterdir(), key=lambda path: path.name == METRICS
-            ):  # by which it is known as a run
+            # last of all the file by which it is known as a run
+            for path in sorted(output.iterdir(), key=lambda path: path.name == METRICS):
                 if path.name in MEANINGS or _is_rest(path):
                     path.unlink()
             return cls(output)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Sequence
 
 import cv2
@@ -87,4 +88,4 @@ def _narrow(image: Image, width: int) -> Image:
 
 def _picture(image: Image, title: str) -> Picture:
     _, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return Picture.of_file(title, title, content.tobytes(), "jpeg")
+    return Picture(title, title, f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode('ascii')}")

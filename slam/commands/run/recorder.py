@@ -17,14 +17,13 @@ from slam.mapping.filters import KeyframeDepth
 from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
-from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
-from slam.results.map_error import map_errors
 from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
 from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.truth import DepthQuality, map_errors
 from slam.runtime.attempt import Failed, attempt
 from slam.runtime.errors import EmptyMapError, SlamError
 from slam.runtime.run_files import CONFIG, GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, PLACES

@@ -74,7 +74,7 @@ def cells(table: str) -> list[list[str]]:
 def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any) -> None:
     results = results_of(job, {"default": [1.0, 3.0]})
     results.append(runs.JobResult(replace(job, seed=2), Metrics(), "out of memory"))
-    text = page.accuracy_tables(results)
+    text = page.error_tables(results)
     *_, head, row = cells(text)
     assert row[head.index("ATE 7-dof, optimised")] == "2.00 ± 1.41"
     assert row[head.index("scale")] == "1.100"

@@ -38,12 +38,7 @@ PAGE = """# Benchmarks
 """
 
 
-def accuracy_tables(results: Sequence[JobResult]) -> str:
-    """The errors and a picture of every drive."""
-    return error_tables(results, f"\n\n![every drive from above]({PICTURE})" if drawable(results) else "")
-
-
-def error_tables(results: Sequence[JobResult], picture: str = "") -> str:
+def error_tables(results: Sequence[JobResult]) -> str:
     """One row for each kind of drive, then one for each sequence and weights."""
     definitions = (m.FRAMES, m.LENGTH, *m.ERRORS, m.PERCENT, m.PERCENT_6, m.OF_NETWORK, m.R_REL, m.SCALE)
     definitions += (m.LOOPS, m.FALSE_LOOPS, m.COVERAGE, m.RATE, m.MEMORY)
@@ -55,7 +50,7 @@ trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG
 
 Every drive:
 
-{table({"sequence": drive, "weights": weights}, columns, results)}{picture}{notes(results, definitions)}"""
+{table({"sequence": drive, "weights": weights}, columns, results)}{notes(results, definitions)}"""
 
 
 def maps_tables(results: Sequence[JobResult]) -> str:
@@ -112,7 +107,7 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
 
 
 TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
-    "accuracy": accuracy_tables,
+    "accuracy": error_tables,
     "full-size": error_tables,
     "maps": maps_tables,
     "handheld": handheld_tables,
@@ -136,6 +131,7 @@ def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: st
     """A section of the page: command, commit and seeds, then its tables."""
     seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
     failed = sum(bool(o.reason) for o in results)
+    picture = f"\n\n![every drive from above]({PICTURE})" if mode == "accuracy" and drawable(results) else ""
     return f"""## {mode.capitalize()}
 
     {command}
@@ -143,7 +139,7 @@ def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: st
 Commit {revision()}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_time} at a time on
 {os.cpu_count()} {platform.machine()} cores.
 
-{TABLES[mode](results)}
+{TABLES[mode](results)}{picture}
 """
 
 

@@ -170,7 +170,8 @@ def run_drives(
             outcomes[number] = result
             progress("drives", len(outcomes), len(drives))
     ordered = [outcomes[number] for number in range(len(drives))]
-    _write_summary(output, ordered)
+    content = csv_of(map(_row, ordered))
+    write_atomically(output / CSV, lambda path: path.write_text(content, encoding="utf-8", newline=""), RunError)
     return ordered
 
 
@@ -329,11 +330,6 @@ def _is_whole(folder: Path, arguments: list[str]) -> bool:
     except SlamError:
         return False
     return metrics.status == "ok" and metrics.provenance.command == shlex.join(["erfsfm-slam", *arguments])
-
-
-def _write_summary(output: Path, outcomes: Sequence[Outcome]) -> None:
-    content = csv_of(map(_row, outcomes))
-    write_atomically(output / CSV, lambda path: path.write_text(content, encoding="utf-8", newline=""), RunError)
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:

@@ -113,7 +113,9 @@ def calibrate_camera(
     """
     if output.suffix not in (".yaml", ".yml"):
         raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
-    picture = output.with_suffix(".pdf" if _among_images(output) else ".png")
+    # among images, other than a picture of an earlier calibration, it would be one of them
+    among_images = any(path.stem != output.stem for path in list_images(output.parent))
+    picture = output.with_suffix(".pdf" if among_images else ".png")
     _refuse_other_kind(output, picture)
     require_figure(picture)
     images, own_fps = _open(recording)
@@ -270,11 +272,6 @@ def _refuse_other_kind(output: Path, picture: Path) -> None:
             raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
     if picture.exists() and not (source or "").startswith(_MARK):
         raise CalibrationError(f"{picture} exists and is of no earlier calibration: choose another --output")
-
-
-def _among_images(output: Path) -> bool:
-    """Whether the folder of the output holds images, other than a picture of an earlier calibration."""
-    return any(path.stem != output.stem for path in list_images(output.parent))
 
 
 def _open(recording: Path) -> tuple[ImageSource, float | None]:

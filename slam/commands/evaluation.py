@@ -59,7 +59,9 @@ def against_reference(
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:
-        systems_table(runs, reference).print()
+        notes = [UNITS, *missing_notes({run.system: run.errors for run in runs})]
+        head = ["system", "poses", *(column.name for column in COLUMNS)]
+        Table(head, list(_rows(runs)), f"Errors against {reference}", notes).print()
     _require([f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)])
 
 
@@ -183,14 +185,8 @@ def compare(
     return runs
 
 
-def systems_table(runs: Sequence[SystemRun], reference: Path) -> Table:
-    """A row for each system; of several trajectories of one, the mean and the deviation of a sample."""
-    notes = [UNITS, *missing_notes({run.system: run.errors for run in runs})]
-    head = ["system", "poses", *(column.name for column in COLUMNS)]
-    return Table(head, list(_rows(runs)), f"Errors against {reference}", notes)
-
-
 def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
+    """A row for each system; of several trajectories of one, the mean and the deviation of a sample."""
     for system in dict.fromkeys(run.system for run in runs):
         own = [run for run in runs if run.system == system]
         poses = "/".join(map(str, sorted({run.poses for run in own})))

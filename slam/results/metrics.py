@@ -250,12 +250,6 @@ class Metrics(Record):
     depth: DepthOfKeyframes = part(DepthOfKeyframes)
     map: MapMetrics = part(MapMetrics)
 
-    @classmethod
-    def of_begun_run(cls, provenance: Provenance) -> Metrics:
-        """Those of a run until its trajectories are whole."""
-        reason = "the run has not ended, or was killed before its trajectories were written"
-        return cls(schema_=1, status="running", reason=reason, provenance=provenance)
-
     def changed(self, **values: Any) -> Metrics:
         """With other values; None takes one out."""
         own = {name: getattr(self, name) for name in self.model_fields_set - {"absent", "reasons"}} | values

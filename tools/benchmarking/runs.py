@@ -68,6 +68,7 @@ _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "no loops": ("loops.enabled=false",),
 }
 MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _MAP_PARTS.items()))
+# stretches of KITTI odometry at the size of its cameras, in a folder of recordings as the tests use it
 ORIGINALS = ("kitti_odometry_original", "failures/kitti03_full")
 
 
@@ -155,11 +156,6 @@ def simulated(
     if not hazards:
         return BenchmarkSequence(name, root, simulate=words, kind=kind)
     return BenchmarkSequence(f"{name}, {condition}", root, simulate=words, kind=f"{kind}, {condition}", clean=name)
-
-
-def original_recordings(data: Path) -> list[BenchmarkSequence]:
-    """Stretches of KITTI odometry at the size of its cameras, in a folder of recordings as the tests use it."""
-    return [drive for root in ORIGINALS for drive in recordings(data / root, (), None)]
 
 
 def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[BenchmarkSequence]:

@@ -109,6 +109,7 @@ class StreamedSequence(GrowingSequence):
     """The frames that were taken so far of a source, which a thread reads until it ends, dies, or sends nothing.
 
     Attributes:
+        waiting: stamps, images, and when they came.
         arrived_s: when the last frames came, by frame, by the monotonic clock.
         dropped: number of images that waited, and were too old when another one came.
         ended: why there are no more, after the last one.
@@ -141,7 +142,7 @@ class StreamedSequence(GrowingSequence):
         self.dropped, self.ended = 0, ""
         self._undistortion = Undistortion(camera) if camera.is_distorted else None
         self._source, self._most_wait_s, self._every_frame = source, most_wait_s, every_frame
-        self._waiting: deque[tuple[float, Image, float]] = deque()  # stamp, image, and when it came
+        self.waiting: deque[tuple[float, Image, float]] = deque()
         self._reason: str | None = None
         self._changed, self._stopped = Condition(), Event()
         self._thread = Thread(target=self._read, name="reader", daemon=True)
@@ -157,16 +158,6 @@ class StreamedSequence(GrowingSequence):
             self.arrived_s = {k: v for k, v in self.arrived_s.items() if k >= index - 2} | {index: at_s}
             yield Frame(index, stamp, image)
 
-    @property
-    def is_waiting(self) -> bool:
-        """Whether an image waits to be taken."""
-        return bool(self._waiting)
-
-    @property
-    def broke_off(self) -> bool:
-        """Whether it neither ended by itself nor was interrupted."""
-        return self.ended not in (_INTERRUPTED, _OVER)
-
     def stop(self) -> None:
         """End after the images that wait."""
         self._stopped.set()
@@ -180,8 +171,8 @@ class StreamedSequence(GrowingSequence):
 
     def _take(self) -> tuple[float, Image, float] | None:
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._reason is not None, self._most_wait_s)
-            taken = self._waiting.popleft() if self._waiting else None
+            self._changed.wait_for(lambda: self.waiting or self._reason is not None, self._most_wait_s)
+            taken = self.waiting.popleft() if self.waiting else None
             self._changed.notify()
             if taken is None:
                 self.ended = self._reason or f"nothing came for {self._most_wait_s:g} s"
@@ -193,13 +184,13 @@ class StreamedSequence(GrowingSequence):
             for stamp, image in self._source.images(self._stopped):
                 with self._changed:
                     if self._every_frame:
-                        self._changed.wait_for(lambda: not self._waiting or self._stopped.is_set())
+                        self._changed.wait_for(lambda: not self.waiting or self._stopped.is_set())
                     if self._stopped.is_set():
                         return
-                    while self._waiting and stamp - self._waiting[0][0] > _MOST_LATE_S:
-                        self._waiting.popleft()
+                    while self.waiting and stamp - self.waiting[0][0] > _MOST_LATE_S:
+                        self.waiting.popleft()
                         self.dropped += 1
-                    self._waiting.append((stamp, image, time.monotonic()))
+                    self.waiting.append((stamp, image, time.monotonic()))
                     self._changed.notify()
             self._end(_OVER)
         except SequenceError as error:
@@ -223,7 +214,7 @@ class LiveRecorder(FolderRecorder):
     def frame(self, observer: Observer) -> None:
         """Say the poses of frames that were finished since the last call."""
         sequence = self._sequence
-        if not sequence.is_waiting:
+        if not sequence.waiting:
             observer.flush()
         self._say_dropped()
         for newest in self._poses.add(observer):
@@ -251,7 +242,8 @@ class LiveRecorder(FolderRecorder):
         if self._viewer is not None:
             self._viewer.correct(trajectory)
         (logger.warning if sequence.dropped else logger.info)("%d images were dropped", sequence.dropped)
-        (logger.warning if sequence.broke_off else logger.info)("the stream ended: %s", sequence.ended)
+        is_expected = sequence.ended in (_INTERRUPTED, _OVER)
+        (logger.info if is_expected else logger.warning)("the stream ended: %s", sequence.ended)
 
     def leave(self) -> None:
         """The poses so far, which nothing else could give again."""

@@ -31,6 +31,7 @@ from slam.runtime.storage.files import from_anywhere
 
 logger = logging.getLogger(__name__)
 
+_BEGUN = "the run has not ended, or was killed before its trajectories were written"
 _NO_KEYFRAMES = "no frame for the map has depth"
 
 
@@ -48,7 +49,7 @@ class FolderRecorder(Recorder):
         """Prepare to write what a pipeline gives."""
         self.folder, self.pipeline = folder, pipeline
         self._settings, self._provenance, self._progress = settings, provenance, progress
-        self._metrics = Metrics.of_begun_run(provenance)
+        self._metrics = Metrics(schema_=1, status="running", reason=_BEGUN, provenance=provenance)
 
     def begin(self) -> None:
         """The metrics and settings of a run that begins; the source of depth by its whole path."""

@@ -100,7 +100,7 @@ def calibrate_camera(
         board: the board.
         model: of the lens.
         output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``, or among
-            images, where it would be one of them, as ``camera.pdf``.
+            other images, where it would be one of them, as ``camera.pdf``.
         fps: to write; None for the rate of the video, or 10.
         progress: called with (stage, done, total).
 
@@ -113,7 +113,6 @@ def calibrate_camera(
     """
     if output.suffix not in (".yaml", ".yml"):
         raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
-    # among images, other than a picture of an earlier calibration, it would be one of them
     among_images = any(path.stem != output.stem for path in list_images(output.parent))
     picture = output.with_suffix(".pdf" if among_images else ".png")
     _refuse_other_kind(output, picture)

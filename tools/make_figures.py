@@ -28,6 +28,7 @@ from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.results.report.figures import LOOKS
 from slam.results.report.map_view import MapMesh, thinned_mesh
+from slam.results.report.pictures import narrowed
 from slam.runtime.imports import import_open3d
 from slam.runtime.run_files import MAP_MESH, REFERENCE, TRAJECTORIES
 from slam.sequences.catalogue import open_sequence
@@ -60,7 +61,7 @@ def main() -> None:
     else:
         picture = np.hstack([seat(folder, sequence, frame) for frame in arguments.seat])
         if picture.shape[1] > WIDTH_PX:
-            picture = _narrowed(picture, WIDTH_PX)
+            picture = narrowed(picture, WIDTH_PX)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     small = [cv2.IMWRITE_PNG_COMPRESSION, 9] if arguments.output.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 85]
     cv2.imwrite(str(arguments.output), picture[..., ::-1], small)
@@ -74,9 +75,7 @@ def seat(folder: RunFolder, sequence: Sequence, frame: int) -> NDArray[np.uint8]
     rays = np.stack([u, v, np.full_like(u, SEAT_PX[1])], axis=-1) @ T_world_camera[:3, :3].T
     below = cast(thinned_mesh(folder.require(MAP_MESH), MOST_TRIANGLES), T_world_camera[:3, 3], rays)
     image = sequence.frame(frame).image
-    height = round(image.shape[0] * below.shape[1] / image.shape[1])
-    above = cv2.resize(image, (below.shape[1], height), interpolation=cv2.INTER_AREA)
-    return np.concatenate([above, below])
+    return np.concatenate([narrowed(image, below.shape[1]), below])
 
 
 def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredictor) -> NDArray[np.uint8]:
@@ -85,7 +84,7 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
     images = [sequence.frame(int(k)).image for k in chosen]
     strips = [np.concatenate([image, colour_disparity(predictor.depth(image))]) for image in images]
     trajectories = trajectories_of(folder)
-    top = _narrowed(np.concatenate(strips, axis=1), WIDTH_PX)
+    top = narrowed(np.concatenate(strips, axis=1), WIDTH_PX)
     with rc_context(STYLE):
         figure = Figure(figsize=(7.4, 5.6), layout="constrained")
         draw_trajectories(figure, trajectories, "m")
@@ -144,12 +143,7 @@ def _raster(figure: Figure, width: int) -> NDArray[np.uint8]:
     """A figure as pixels of a given width."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return _narrowed(np.asarray(canvas.buffer_rgba())[..., :3], width)
-
-
-def _narrowed(pixels: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    height = round(pixels.shape[0] * width / pixels.shape[1])
-    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    return narrowed(np.asarray(canvas.buffer_rgba())[..., :3], width)
 
 
 def _padded(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 from slam.formats.ply import Ply
 from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN
 from slam.geometry.se3 import FloatArray
+from slam.mapping.views import moved_rows
 from slam.runtime.errors import RunError
 
 OBSTACLE_FROM_M, OBSTACLE_TO_M = 0.3, 2.5
@@ -178,7 +180,7 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
     Raises:
         RunError: there is no map below the cameras.
     """
-    chosen = _spread(T_world_camera, _ANCHOR_STEP * camera_height)
+    chosen = moved_rows(T_world_camera, _ANCHOR_STEP * camera_height, math.inf)
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]
     tree = cKDTree(points[:, :2])
 
@@ -201,15 +203,6 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
         anchors.append(anchor)
         slopes.append(slope)
     return Ground(np.array(anchors), np.array(slopes), _REACH * height)
-
-
-def _spread(T_world_camera: FloatArray, step: float) -> list[int]:
-    """Poses at least so far from the one before."""
-    chosen = [0]
-    for k, T in enumerate(T_world_camera):
-        if np.linalg.norm(T[:3, 3] - T_world_camera[chosen[-1], :3, 3]) >= step:
-            chosen.append(k)
-    return chosen
 
 
 def _plane(points: FloatArray, start: FloatArray, tilt: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:

@@ -188,8 +188,9 @@ def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: i
     calibrate, project = cv2.calibrateCamera, cv2.projectPoints
     if is_fisheye:
         calibrate, project = cv2.fisheye.calibrate, cv2.fisheye.projectPoints
-    corners = [view.corners_m[:, None].astype(np.float32) for view in views]
-    pixels = [view.pixels[:, None].astype(np.float32) for view in views]
+    precision = np.float64 if is_fisheye else np.float32
+    corners = [view.corners_m[None].astype(precision) for view in views]
+    pixels = [view.pixels[None].astype(precision) for view in views]
     start = (np.zeros((3, 3)), np.zeros((4, 1))) if is_fisheye else (None, None)
     _, K, distortion, turns, places = calibrate(corners, pixels, (width, height), *start, flags=flags)
     distortion = distortion.ravel()[:5]

@@ -191,7 +191,7 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
 class Scripted:
     """A source of small images that calls ``before`` with the number of each, and may die after the last one."""
 
-    width, height, fps, is_stored = 8, 6, 10.0, False
+    width, height, fps, is_stored = 8, 8, 10.0, False
 
     def __init__(self, images: int, before: Callable[[int], object], dies: bool = False) -> None:
         self._images, self._before, self._dies, self.is_over = images, before, dies, Event()
@@ -199,7 +199,7 @@ class Scripted:
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
         for number in range(self._images):
             self._before(number)
-            yield 0.1 * number, np.full((6, 8, 3), number, np.uint8)
+            yield 0.1 * number, np.full((8, 8, 3), number, np.uint8)
         self.is_over.set()
         if self._dies:
             raise SequenceError("the cable was pulled")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from argparse import Namespace
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -61,24 +62,13 @@ def drives(options: Namespace, folder: Path) -> list[BenchmarkSequence]:
         name = root.parent.name
         found.append(BenchmarkSequence(name, root, "", kind=name, truth=poses_beside(root)))
     seeds = () if options.rooms is None else options.rooms or SEEDS
-    found += [
-        _room(folder, seed, motion, rate, hazard, options.seconds * rate)
-        for hazard in options.hazards
-        for rate in options.rates
-        for motion in options.motions
-        for seed in seeds
-    ]
-    return found
-
-
-def _room(
-    folder: Path, seed: int, motion: Motion, rate: int, condition: RoomCondition, frames: int
-) -> BenchmarkSequence:
     width, height = SIZE
-    words = ["--route", "rooms", "--seed", str(seed), "--frames", str(frames), "--motion", motion, "--rate", str(rate)]
-    words += ["--width", str(width), "--height", str(height)]
-    name, hazards = f"rooms {seed}, {motion}, {rate} Hz", "" if condition == "clean" else condition
-    return simulated(folder, name, f"rooms, {rate} Hz", words, condition, hazards)
+    for condition, rate, motion, seed in product(options.hazards, options.rates, options.motions, seeds):
+        words = ["--route", "rooms", "--seed", str(seed), "--frames", str(options.seconds * rate), "--motion", motion]
+        words += ["--rate", str(rate), "--width", str(width), "--height", str(height)]
+        name, hazards = f"rooms {seed}, {motion}, {rate} Hz", "" if condition == "clean" else condition
+        found.append(simulated(folder, name, f"rooms, {rate} Hz", words, condition, hazards))
+    return found
 
 
 @functools.cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -185,9 +185,8 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
 def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: int) -> Calibration:
     """A camera, its residuals, and how sure its focal length is by the normal equations with the poses eliminated."""
     is_fisheye = model == "fisheye"
-    calibrate, project = cv2.calibrateCamera, cv2.projectPoints
-    if is_fisheye:
-        calibrate, project = cv2.fisheye.calibrate, cv2.fisheye.projectPoints
+    calibrate: Any = cv2.fisheye.calibrate if is_fisheye else cv2.calibrateCamera
+    project: Any = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
     precision = np.float64 if is_fisheye else np.float32
     corners = [view.corners_m[None].astype(precision) for view in views]
     pixels = [view.pixels[None].astype(precision) for view in views]

@@ -21,12 +21,11 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 from benchmarking import handheld, page, pairs
-from benchmarking import plan as p
+from benchmarking import runs as p
 from benchmarking.metrics import rows
-from benchmarking.work import ROOT, measured, revision, simulate, workers
 from shared.command import one_line_errors, parser_of
 
 from erfsfm.common.table import csv_of
@@ -68,17 +67,13 @@ def main(words: Sequence[str] | None = None) -> None:
     jobs = _jobs(options)
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or a recording; see --help")
-    with workers(options.jobs, options.scheduler) as spread:
-        results = measured(jobs, spread)
+    results = p.measured(jobs, options.jobs, options.scheduler)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
     content = csv_of(table_of_runs).encode()
     write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(content))
     text = page.section(options.mode, command, results, "several" if options.scheduler else str(options.jobs))
     _write_section(options, text)
-    if options.mode in ("accuracy", "full-size"):
-        print(page.summary_table(results))
-    if options.mode == "handheld":
-        print(page.handheld_summary(results))
+    print(text)
     if options.mode == "accuracy" and page.drawable(results):
         page.draw(results, options.report.parent / page.PICTURE)
     print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
@@ -88,7 +83,7 @@ def _write_section(options: argparse.Namespace, text: str) -> None:
     """Into the page, with names in place of the paths of one machine."""
     folders = [*getattr(options, "drives", ()), *getattr(options, "folders", ())]
     known = [(getattr(options, name, None), name.upper()) for name in _PATHS]
-    for path, name in (*known, *((folder.parent, folder.parent.name) for folder in folders), (ROOT, ".")):
+    for path, name in (*known, *((folder.parent, folder.parent.name) for folder in folders), (p.ROOT, ".")):
         for written in (str(path.resolve()), str(path)) if path else ():
             text = text.replace(written, name)
     report: Path = options.report
@@ -107,32 +102,31 @@ def _compare_speed(options: argparse.Namespace, command: str) -> None:
         drives[folder.resolve().parent.name] = ["--dataset", str(folder.resolve())]
     if options.frames:
         (grid,) = p.worlds((options.output / "worlds").resolve(), ["grid"], [610], options.frames)
-        simulate(grid)
+        p.make(grid)
         drives[f"grid 610, {options.frames} frames"] = ["--dataset", str(grid.root)]
     runs = (options.output / "speed").resolve()
     shutil.rmtree(runs, ignore_errors=True)
     runs.mkdir(parents=True)
-    checkouts = zip(("before", "after"), (options.against.resolve(), ROOT))
-    named = {f"{when} ({revision(checkout)})": checkout for when, checkout in checkouts}
+    checkouts = zip(("before", "after"), (options.against.resolve(), p.ROOT))
+    named = {f"{when} ({p.revision(checkout)})": checkout for when, checkout in checkouts}
     text = pairs.tables(pairs.in_turn(named, drives, options.pairs, runs))
     _write_section(options, page.speed_section(command, text))
     print(text)
 
 
 def _jobs(options: argparse.Namespace) -> list[p.Job]:
-    folder = options.output.resolve() / options.mode
+    folder = options.output.resolve() / options.mode / p.revision()
     simulated = (options.worlds_in or options.output / "worlds").resolve()
-    truth: tuple[Literal["depth"], ...] = ("depth",) if options.mode == "maps" else ()
-    size = p.FULL_SIZE if options.mode == "full-size" else None
+    of_worlds = {"maps": ("--depth",), "full-size": ("--width", "1242", "--height", "375")}.get(options.mode, ())
     if options.mode == "handheld":
         drives = handheld.drives(options, simulated)
     else:
-        drives = p.worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth, size)
+        drives = p.worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, of_worlds)
     drives += p.raw_drives(getattr(options, "drives", ()))
     if getattr(options, "kitti", None) is not None:
         drives += p.recordings(options.kitti.resolve(), options.sequences, options.excerpt)
     if getattr(options, "data", None) is not None:
-        drives += p.original_recordings(options.data.resolve())
+        drives += [d for root in p.ORIGINALS for d in p.recordings(options.data.resolve() / root, (), None)]
     configurations = MODES[options.mode].configurations
     parts = getattr(options, "parts", None)
     if parts is not None:

@@ -1,4 +1,4 @@
-"""The pictures of README and docs, from run folders.
+"""The pictures of README and docs, from run folders: trajectories by matplotlib, the map by casting rays at it.
 
 Example: python tools/make_figures.py results/latest docs/images/demo.png
 Example: python tools/make_figures.py results/latest docs/images/map-0013.jpg --dataset DRIVE_0013 --seat 80
@@ -7,27 +7,39 @@ Example: python tools/make_figures.py results/latest docs/images/map-rooms.jpg -
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 from shared.command import one_line_errors, parser_of
-from shared.pictures import STYLE, cast, draw_trajectories, trajectories_of
 
 from erfsfm.inference import DepthPosePredictor, colour_disparity
+from slam.evaluation.drift import aligned
+from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence
+from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
+from slam.results.report.figures import LOOKS
 from slam.results.report.map_view import MapMesh, thinned_mesh
-from slam.runtime.run_files import MAP_MESH
+from slam.results.report.pictures import narrowed
+from slam.runtime.imports import import_open3d
+from slam.runtime.run_files import MAP_MESH, REFERENCE, TRAJECTORIES
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600
 SEAT_PX = 1280, 720
 MOST_TRIANGLES = 4_000_000
+STYLE: dict[str, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True}
+STYLE |= {"axes.axisbelow": True, "grid.color": "#e3e6ea", "legend.fontsize": 9, "legend.frameon": False}
+SKY = (226, 232, 239)
+_DASHES = {"dash": "dashed", "dot": "dotted"}
 
 
 @one_line_errors()
@@ -49,7 +61,7 @@ def main() -> None:
     else:
         picture = np.hstack([seat(folder, sequence, frame) for frame in arguments.seat])
         if picture.shape[1] > WIDTH_PX:
-            picture = _narrowed(picture, WIDTH_PX)
+            picture = narrowed(picture, WIDTH_PX)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     small = [cv2.IMWRITE_PNG_COMPRESSION, 9] if arguments.output.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 85]
     cv2.imwrite(str(arguments.output), picture[..., ::-1], small)
@@ -63,9 +75,7 @@ def seat(folder: RunFolder, sequence: Sequence, frame: int) -> NDArray[np.uint8]
     rays = np.stack([u, v, np.full_like(u, SEAT_PX[1])], axis=-1) @ T_world_camera[:3, :3].T
     below = cast(thinned_mesh(folder.require(MAP_MESH), MOST_TRIANGLES), T_world_camera[:3, 3], rays)
     image = sequence.frame(frame).image
-    height = round(image.shape[0] * below.shape[1] / image.shape[1])
-    above = cv2.resize(image, (below.shape[1], height), interpolation=cv2.INTER_AREA)
-    return np.concatenate([above, below])
+    return np.concatenate([narrowed(image, below.shape[1]), below])
 
 
 def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredictor) -> NDArray[np.uint8]:
@@ -74,7 +84,7 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
     images = [sequence.frame(int(k)).image for k in chosen]
     strips = [np.concatenate([image, colour_disparity(predictor.depth(image))]) for image in images]
     trajectories = trajectories_of(folder)
-    top = _narrowed(np.concatenate(strips, axis=1), WIDTH_PX)
+    top = narrowed(np.concatenate(strips, axis=1), WIDTH_PX)
     with rc_context(STYLE):
         figure = Figure(figsize=(7.4, 5.6), layout="constrained")
         draw_trajectories(figure, trajectories, "m")
@@ -93,16 +103,47 @@ def above(mesh: MapMesh, width: int) -> NDArray[np.uint8]:
     return cast(mesh, origins, np.array([0.0, 1.0, 0.0]))
 
 
+def trajectories_of(folder: RunFolder) -> dict[str, Trajectory]:
+    """The trajectories of a run, the reference first."""
+    found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
+    return {name: trajectory for name, trajectory in found.items() if trajectory is not None}
+
+
+def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> Axes:
+    """Draw them on a figure or a part of one, aligned to the reference where there is one."""
+    axes = canvas.subplots()
+    for name, trajectory in aligned(trajectories).items():
+        label, colour, width, dash = LOOKS[name]
+        look: dict[str, Any] = {"color": colour or "black", "linewidth": width, "linestyle": _DASHES.get(dash, dash)}
+        axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 2], label=label, **look)
+    axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    axes.legend()
+    return axes
+
+
+def cast(mesh: MapMesh, origins: FloatArray, directions: FloatArray) -> NDArray[np.uint8]:
+    """Colours ``(H, W, 3)`` where rays ``(H, W, 3)`` meet a mesh, and of the sky elsewhere."""
+    o3d = import_open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh.points.astype(np.float32), mesh.triangles.astype(np.uint32))
+    rays = np.concatenate(np.broadcast_arrays(origins, directions), axis=-1).astype(np.float32)
+    hit = scene.cast_rays(o3d.core.Tensor(rays))
+    reached = np.isfinite(hit["t_hit"].numpy())
+    u, v = hit["primitive_uvs"].numpy()[reached].T
+    corners = mesh.colours[mesh.triangles[hit["primitive_ids"].numpy()[reached]]].astype(np.float32)
+    picture = np.tile(np.array(SKY, np.uint8), (*reached.shape, 1))
+    mixed = np.einsum("pc,pcr->pr", np.stack([1.0 - u - v, u, v], axis=1), corners)
+    picture[reached] = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
+    return picture
+
+
 def _raster(figure: Figure, width: int) -> NDArray[np.uint8]:
     """A figure as pixels of a given width."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return _narrowed(np.asarray(canvas.buffer_rgba())[..., :3], width)
-
-
-def _narrowed(pixels: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    height = round(pixels.shape[0] * width / pixels.shape[1])
-    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    return narrowed(np.asarray(canvas.buffer_rgba())[..., :3], width)
 
 
 def _padded(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:

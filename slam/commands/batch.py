@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import fcntl
 import io
+import logging
 import os
 import re
 import runpy
@@ -12,7 +13,8 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,15 +26,17 @@ from erfsfm.common.progress import Progress
 from erfsfm.common.readers.frame_range import EVERYTHING
 from erfsfm.common.table import Table, csv_of
 from erfsfm.inference import record_of_whole_weights
-from slam.commands.cluster import workers
 from slam.config.sections import load_config
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.results.tables import written
 from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import from_anywhere, write_atomically
 from slam.sequences.catalogue import sequence_names
 from slam.sequences.recording import frame_range
+
+Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 
 CSV = "drives.csv"
 _MANIFEST = ".csv"
@@ -166,8 +170,53 @@ def run_drives(
             outcomes[number] = result
             progress("drives", len(outcomes), len(drives))
     ordered = [outcomes[number] for number in range(len(drives))]
-    _write_summary(output, ordered)
+    content = csv_of(map(_row, ordered))
+    write_atomically(output / CSV, lambda path: path.write_text(content, encoding="utf-8", newline=""), RunError)
     return ordered
+
+
+@contextmanager
+def workers(count: int, scheduler: str | None = None) -> Iterator[Spread]:
+    """A map over items that yields ``(number, result)`` as they end.
+
+    Items of a worker that dies are given to another; the result of one that fails is its exception, also where several
+    workers died of it.
+
+    Args:
+        count: workers on this machine; 1 without a scheduler works here, and needs no Dask.
+        scheduler: address of a Dask scheduler, whose workers are used instead.
+
+    Raises:
+        SlamError: Dask is not installed, or the scheduler does not answer.
+    """
+    if count == 1 and scheduler is None:
+        yield _one_after_another
+        return
+    (distributed,) = import_extra("cluster")
+    # memory is that of each drive's process, whose limit is not Dask's
+    local = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0", "memory_limit": None}
+    local |= {"silence_logs": logging.CRITICAL}
+    try:
+        client = distributed.Client(scheduler, timeout="10s") if scheduler else distributed.Client(**local)
+    except (OSError, ValueError) as error:
+        raise SlamError(f"no Dask scheduler answers at {scheduler}: {' '.join(str(error).split())}") from error
+
+    def spread(work: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        futures = client.map(work, items, pure=False)
+        numbers = {future.key: number for number, future in enumerate(futures)}
+        for future in distributed.as_completed(futures):
+            yield numbers[future.key], future.exception() or future.result()
+
+    with client:
+        yield spread
+
+
+def _one_after_another(work: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+    for number, item in enumerate(items):
+        try:
+            yield number, work(item)
+        except Exception as error:
+            yield number, error
 
 
 def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 0.0) -> Outcome:
@@ -281,11 +330,6 @@ def _is_whole(folder: Path, arguments: list[str]) -> bool:
     except SlamError:
         return False
     return metrics.status == "ok" and metrics.provenance.command == shlex.join(["erfsfm-slam", *arguments])
-
-
-def _write_summary(output: Path, outcomes: Sequence[Outcome]) -> None:
-    content = csv_of(map(_row, outcomes))
-    write_atomically(output / CSV, lambda path: path.write_text(content, encoding="utf-8", newline=""), RunError)
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:

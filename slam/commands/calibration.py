@@ -100,7 +100,7 @@ def calibrate_camera(
         board: the board.
         model: of the lens.
         output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``, or among
-            images, where it would be one of them, as ``camera.pdf``.
+            other images, where it would be one of them, as ``camera.pdf``.
         fps: to write; None for the rate of the video, or 10.
         progress: called with (stage, done, total).
 
@@ -113,20 +113,22 @@ def calibrate_camera(
     """
     if output.suffix not in (".yaml", ".yml"):
         raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
-    picture = output.with_suffix(".pdf" if _among_images(output) else ".png")
+    among_images = any(path.stem != output.stem for path in list_images(output.parent))
+    picture = output.with_suffix(".pdf" if among_images else ".png")
     _refuse_other_kind(output, picture)
     require_figure(picture)
     images, own_fps = _open(recording)
     views = chosen_views(find_views(images, board, progress))
     fit = fit_camera(views, images.width, images.height, model)
     source = f"{_MARK}: {len(fit.views)} views of a {board.describe()}, reprojection error {fit.error_px:.3f} pixels"
+    fx, fy, cx, cy = map(_rounded, fit.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     camera = CameraFile(
         width=fit.width,
         height=fit.height,
-        fx=_rounded(fit.K[0, 0]),
-        fy=_rounded(fit.K[1, 1]),
-        cx=_rounded(fit.K[0, 2]),
-        cy=_rounded(fit.K[1, 2]),
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
         fps=fps or _rounded(own_fps or DEFAULT_FPS),
         camera_height_m="unknown",
         model=model,
@@ -169,9 +171,9 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
         raise CalibrationError(f"{len(views)} sharp views fit one camera, {FEWEST_VIEWS} are needed: take more images")
     try:
         if model == "fisheye":
-            return _fit_fisheye(views, width, height)
-        plain = _fit_opencv(views, width, height, cv2.CALIB_FIX_K3)
-        bent = _fit_opencv(views, width, height, 0)
+            return _fit_lens(views, width, height, model, _FISHEYE_FLAGS)
+        plain = _fit_lens(views, width, height, model, cv2.CALIB_FIX_K3)
+        bent = _fit_lens(views, width, height, model, 0)
     except cv2.error as error:
         reason = " ".join(str(error.err or error).split())
         raise CalibrationError(
@@ -180,53 +182,34 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
     return bent if bent.error_px < _GAIN * plain.error_px else plain
 
 
-def _fit_opencv(views: list[View], width: int, height: int, flags: int) -> Calibration:
-    corners = [view.corners_m.astype(np.float32) for view in views]
-    pixels = [view.pixels.astype(np.float32) for view in views]
-    _, K, distortion, turns, places = cv2.calibrateCamera(corners, pixels, (width, height), None, None, flags=flags)
-    return _calibration("opencv", views, (width, height), K, distortion.ravel()[:5], turns, places)
-
-
-def _fit_fisheye(views: list[View], width: int, height: int) -> Calibration:
-    corners, pixels = [view.corners_m[None] for view in views], [view.pixels[None] for view in views]
-    K, distortion = np.zeros((3, 3)), np.zeros((4, 1))
-    _, K, distortion, turns, places = cv2.fisheye.calibrate(
-        corners, pixels, (width, height), K, distortion, flags=_FISHEYE_FLAGS
-    )
-    return _calibration("fisheye", views, (width, height), K, distortion.ravel(), turns, places)
-
-
-def _calibration(
-    model: Model,
-    views: list[View],
-    size: tuple[int, int],
-    K: FloatArray,
-    distortion: FloatArray,
-    turns: Any,
-    places: Any,
-) -> Calibration:
-    """Residuals of a camera, and how sure its focal length is by the normal equations with the poses eliminated."""
+def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: int) -> Calibration:
+    """A camera, its residuals, and how sure its focal length is by the normal equations with the poses eliminated."""
+    is_fisheye = model == "fisheye"
+    calibrate: Any = cv2.fisheye.calibrate if is_fisheye else cv2.calibrateCamera
+    project: Any = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
+    precision = np.float64 if is_fisheye else np.float32
+    corners = [view.corners_m[None].astype(precision) for view in views]
+    pixels = [view.pixels[None].astype(precision) for view in views]
+    start = (np.zeros((3, 3)), np.zeros((4, 1))) if is_fisheye else (None, None)
+    _, K, distortion, turns, places = calibrate(corners, pixels, (width, height), *start, flags=flags)
+    distortion = distortion.ravel()[:5]
     count = 4 + len(distortion)
+    # where the columns of the camera and of the pose are in OpenCV's derivatives
+    of_camera, of_pose = (slice(count), slice(count, count + 6)) if is_fisheye else (slice(6, 6 + count), slice(6))
     residuals, information = [], np.zeros((count, count))
     T_camera_board = np.tile(np.eye(4), (len(views), 1, 1))
     for T, view, turn, place in zip(T_camera_board, views, turns, places, strict=True):
         T[:3, :3], T[:3, 3] = Rotation.from_rotvec(np.ravel(turn)).as_matrix(), np.ravel(place)
-        if model == "fisheye":
-            pixels, J = cv2.fisheye.projectPoints(view.corners_m[:, None], turn, place, K, distortion)
-            of_camera, of_pose = J[:, :count], J[:, count : count + 6]
-        else:
-            pixels, J = cv2.projectPoints(view.corners_m[:, None], turn, place, K, distortion)
-            of_camera, of_pose = J[:, 6 : 6 + count], J[:, :6]
-        residuals.append(view.pixels - np.asarray(pixels, np.float64).reshape(-1, 2))
-        information += of_camera.T @ (of_camera - of_pose @ np.linalg.lstsq(of_pose, of_camera, rcond=None)[0])
+        projected, J = project(view.corners_m[:, None], turn, place, K, distortion)
+        residuals.append(view.pixels - np.asarray(projected, np.float64).reshape(-1, 2))
+        by_pose = J[:, of_pose] @ np.linalg.lstsq(J[:, of_pose], J[:, of_camera], rcond=None)[0]
+        information += J[:, of_camera].T @ (J[:, of_camera] - by_pose)
     freedom = sum(residual.size for residual in residuals) - count - 6 * len(views)
     variance = sum(float((residual**2).sum()) for residual in residuals) / max(freedom, 1)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    covariance = (
-        variance * np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-    )
-    sigma = float(np.sqrt(max(covariance[:2, :2].mean(), 0.0))) / (0.5 * (K[0, 0] + K[1, 1]))
-    return Calibration(model, *size, np.asarray(K), distortion, views, residuals, T_camera_board, sigma)
+    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+    sigma = float(np.sqrt(max(variance * inverse[:2, :2].mean(), 0.0))) / (0.5 * (K[0, 0] + K[1, 1]))
+    return Calibration(model, width, height, np.asarray(K), distortion, views, residuals, T_camera_board, sigma)
 
 
 def _require_determined(fit: Calibration) -> None:
@@ -288,11 +271,6 @@ def _refuse_other_kind(output: Path, picture: Path) -> None:
             raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
     if picture.exists() and not (source or "").startswith(_MARK):
         raise CalibrationError(f"{picture} exists and is of no earlier calibration: choose another --output")
-
-
-def _among_images(output: Path) -> bool:
-    """Whether the folder of the output holds images, other than a picture of an earlier calibration."""
-    return any(path.stem != output.stem for path in list_images(output.parent))
 
 
 def _open(recording: Path) -> tuple[ImageSource, float | None]:

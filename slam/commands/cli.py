@@ -245,8 +245,7 @@ def localize(
     Example: erfsfm-slam localize photos --map results/latest --output photos.tum
     """
     from slam.commands.localisation import localisation_table, localise, write_localisations
-    from slam.results.folder import RunFolder
-    from slam.results.output import check_replaced
+    from slam.results.folder import RunFolder, check_replaced
 
     run_folder = RunFolder.open(map)
     if output is not None:

@@ -88,16 +88,12 @@ def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:
         sequence = open_sequence(root, name, camera)
     except SlamError as error:
         return f"missing  sequence {name}: {error} ({kind})"
-    truth = "true poses" if sequence.reference is not None else "no true poses" + _unused_truth(root)
+    truth, beside = "true poses", poses_beside(root)
+    if sequence.reference is None:
+        truth = "no true poses" + ("" if beside is None else f" (--truth {beside} gives some)")
     height = f"camera {sequence.camera_height_m:.2f} m high" if sequence.camera_height_m else "camera height unknown"
     scans = sum(sequence.has_scan(k) for k in range(len(sequence)))
     size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
     return (
         f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans ({kind})"
     )
-
-
-def _unused_truth(root: Path) -> str:
-    """How to use a file of poses that lies in or beside a recording."""
-    found = poses_beside(root)
-    return "" if found is None else f" (--truth {found} gives some)"

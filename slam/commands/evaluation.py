@@ -1,23 +1,37 @@
-"""Errors of trajectories or of whole runs, printed as a table or as JSON."""
+"""Errors of trajectories or of whole runs against a truth, as a table, as JSON or as CSV."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import typer
 
+from erfsfm.common.table import Table, csv_of
 from slam.evaluation.mistakes import likely_mistakes
-from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
-from slam.formats.trajectory import associate
-from slam.results.folder import RunFolder
-from slam.results.output import check_replaced
-from slam.results.systems import compare, named_paths, systems_table, trajectory_at, write_csv
-from slam.results.tables import alignments_table, runs_json, runs_table
-from slam.runtime.errors import SlamError
-from slam.runtime.run_files import REFERENCE
+from slam.evaluation.trajectory import TrajectoryMetrics, evo_commands, exceeded, trajectory_metrics
+from slam.formats.trajectory import Trajectory, associate, read_trajectory
+from slam.results.folder import RunFolder, check_replaced
+from slam.results.tables import (
+    COLUMNS,
+    UNITS,
+    ErrorColumn,
+    alignments_table,
+    missing_notes,
+    runs_json,
+    runs_table,
+    written,
+)
+from slam.runtime.errors import RunError, SlamError, TrajectoryError
+from slam.runtime.run_files import REFERENCE, trajectory_file
+from slam.runtime.storage.files import write_atomically
+from slam.sequences.recording import frame_range
 
 logger = logging.getLogger(__name__)
 
@@ -40,11 +54,14 @@ def against_reference(
         check_replaced(csv, {".csv": b"system,path"})
     runs = compare(named_paths(paths), reference, format, frames)
     if csv is not None:
-        write_csv(runs, csv)
+        content = csv_of(dict(_flat(run.tree())) for run in runs)
+        write_atomically(csv, lambda partial: partial.write_text(content, encoding="utf-8", newline=""), RunError)
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:
-        systems_table(runs, reference).print()
+        notes = [UNITS, *missing_notes({run.system: run.errors for run in runs})]
+        head = ["system", "poses", *(column.name for column in COLUMNS)]
+        Table(head, list(_rows(runs)), f"Errors against {reference}", notes).print()
     _require([f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)])
 
 
@@ -67,25 +84,129 @@ def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], 
     Raises:
         SlamError: a file cannot be read, or an error is over its limit.
     """
-    missing = next((path for path in (estimate, reference) if not path.exists()), None)
-    if missing is not None:
-        raise SlamError(f"{missing}: no such file or folder")
-    whole = trajectory_at(estimate, format), trajectory_at(reference, format, REFERENCE)
-    pair = associate(*whole)
-    metrics = trajectory_metrics(*pair)
-    for line in likely_mistakes(*whole, pair):
-        logger.warning(line)
+    (run,) = compare([("", estimate)], reference, format)
     if as_json:
-        typer.echo(metrics.to_json())
+        typer.echo(run.errors.to_json())
     else:
-        alignments_table(metrics, f"{estimate.name} against {reference.name}").print()
-        kind = "tum" if all(each.timed for each in whole) else "kitti"
-        names = (estimate, "trajectory_optimised"), (reference, REFERENCE)
-        ours, theirs = (path / f"{name}.{kind}.txt" if path.is_dir() else path for path, name in names)
-        typer.echo("\n".join(evo_commands(ours, theirs, format)))
-    _require(exceeded(metrics, limits))
+        alignments_table(run.errors, f"{estimate.name} against {reference.name}").print()
+        both = {estimate: "optimised", reference: REFERENCE}
+        timed = all(trajectory_at(path, format, name).timed for path, name in both.items())
+        kind = "tum" if timed else "kitti"
+        files = [path / trajectory_file(name, kind) if path.is_dir() else path for path, name in both.items()]
+        typer.echo("\n".join(evo_commands(files[0], files[-1], format)))
+    _require(exceeded(run.errors, limits))
 
 
 def _require(broken: Sequence[str]) -> None:
     if broken:
         raise SlamError("; ".join(broken))
+
+
+@dataclass(frozen=True)
+class SystemRun:
+    """One trajectory of a system, the number of its poses that have a true one, and its errors."""
+
+    system: str
+    path: Path
+    poses: int
+    errors: TrajectoryMetrics
+
+    def tree(self) -> dict[str, Any]:
+        """For JSON: the system, the file, the number of compared poses, and T of ``metrics.json``."""
+        return {"system": self.system, "path": str(self.path), "poses": self.poses} | self.errors.tree()
+
+
+def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
+    """Files and run folders with the names of their systems.
+
+    Args:
+        words: each a path, whose system has the name of the file or folder, or ``NAME=PATH``, where PATH may be a
+            pattern (``orb=runs/orb_*.txt``); all paths of one NAME are of one system.
+
+    Raises:
+        RunError: a pattern that no file fits.
+    """
+    found: list[tuple[str, Path]] = []
+    for word in words:
+        name, _, pattern = word.rpartition("=")
+        if not name or Path(word).exists():
+            path = Path(word)
+            found.append((path.resolve().name if path.is_dir() else path.stem, path))
+            continue
+        paths = sorted(glob(pattern))  # noqa: PTH207 - Path.glob takes no whole path
+        if not paths:
+            raise RunError(f"{word}: no file or folder is named {pattern}")
+        found += [(name, Path(path)) for path in paths]
+    plain = [name for (name, _), word in zip(found, words) if Path(word).exists()]
+    return [(str(path) if plain.count(name) > 1 else name, path) for name, path in found]
+
+
+def trajectory_at(path: Path, format: str = "auto", of_run: str = "optimised") -> Trajectory:
+    """A trajectory file, or one of the trajectories of a run folder.
+
+    Raises:
+        SlamError: it cannot be read, or the run has none.
+    """
+    if not path.is_dir():
+        return read_trajectory(path, format)
+    trajectory = RunFolder.open(path).trajectory(of_run)
+    if trajectory is None:
+        raise RunError(f"{path} has no {of_run} trajectory: give a trajectory file, or another run")
+    return trajectory
+
+
+def compare(
+    paths: Sequence[tuple[str, Path]], reference: Path, format: str = "auto", frames: str | None = None
+) -> list[SystemRun]:
+    """Errors of trajectories against one reference.
+
+    Args:
+        paths: files or run folders by system (`named_paths`).
+        reference: a trajectory file, or a run folder with a reference.
+        format: of the files.
+        frames: ``A:B`` of the reference, half-open; a file of B - A rows without frame numbers is of these frames.
+
+    Raises:
+        SlamError: a file cannot be read, or its poses do not belong to those of the reference.
+    """
+    truth = trajectory_at(reference, format, REFERENCE)
+    chosen = None if frames is None else frame_range(frames, len(truth))
+    runs = []
+    for name, path in paths:
+        estimate = trajectory_at(path, format)
+        try:
+            pair = associate(estimate, truth, chosen)
+        except TrajectoryError as error:
+            raise TrajectoryError(f"{path}: {error}") from error
+        for mistake in likely_mistakes(estimate, truth, pair):
+            line = f"{path}: {mistake}"
+            logger.warning(line)
+        runs.append(SystemRun(name, path, len(pair[0]), trajectory_metrics(*pair)))
+    return runs
+
+
+def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
+    """A row for each system; of several trajectories of one, the mean and the deviation of a sample."""
+    for system in dict.fromkeys(run.system for run in runs):
+        own = [run for run in runs if run.system == system]
+        poses = "/".join(map(str, sorted({run.poses for run in own})))
+        name = f"{system} ({len(own)} runs)" if len(own) > 1 else system
+        yield [name, poses, *(_spread(column, own) for column in COLUMNS)]
+
+
+def _spread(column: ErrorColumn, runs: Sequence[SystemRun]) -> str:
+    """The number of one run; of several the mean and the deviation of those that have it."""
+    values = [value for value in (run.errors.at(column.path)[0] for run in runs) if value is not None]
+    if len(values) < 2:
+        return written(values[0] if values else None, column.decimals)
+    mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))
+    return f"{written(mean, column.decimals)} ± {written(deviation, column.decimals)}"
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers by their dotted paths, without reasons."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif not key.endswith("_reason"):
+            yield prefix + key, value

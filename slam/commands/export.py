@@ -1,49 +1,69 @@
-"""Parts of a run as files for other programs."""
+"""Parts of a run as files for other programs: its map, an occupancy grid, images with poses and points."""
 
 from __future__ import annotations
 
+import json
+import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import is_foreign
 from erfsfm.common.progress import Progress, silent
 from slam.commands.occupancy import occupancy_grid, write_ros_map
-from slam.commands.scenes import MARK, POINTS, TRANSFORMS, write_model, write_scene
-from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES
+from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
-from slam.formats.trajectory import Trajectory
+from slam.formats.trajectory import Trajectory, nearest_stamps
+from slam.frames import Intrinsics, Sequence
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.results.folder import RunFolder
+from slam.loops.places import Places
+from slam.loops.structure import PlaceStructure
+from slam.loops.verification import OF_KEYFRAMES
+from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
-from slam.results.output import check_replaced
-from slam.runtime.errors import RunError
-from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH
+from slam.runtime.errors import RunError, SlamError
+from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES
+from slam.runtime.storage.files import write_atomically
+from slam.sequences.camera_file import is_field_of_view
+from slam.sequences.catalogue import open_sequence
 
-What = Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"]
-Up = Literal["y-down", "z"]
+logger = logging.getLogger(__name__)
+
 # from a camera's x right, y down, z ahead
-R_UP_WORLDS: dict[Up, FloatArray] = {
+R_UP_WORLDS = {
     "y-down": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # x right, y ahead, z up
 }
+POINTS, TRANSFORMS = "points.ply", "transforms.json"
+_IMAGES = "images"
+_MADE_BY = {"made_by": "erfsfm-slam"}
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
-_SCENES = {
-    "colmap": ("a COLMAP model", ("images", BINARY_FOLDER, *MODEL_FILES), MODEL_FILES[0], HEADER),
-    "nerfstudio": ("a scene", ("images", POINTS, TRANSFORMS), TRANSFORMS, MARK),
+_SCENES = {  # noun, files, and what one of them holds if it is ours
+    "colmap": ("a COLMAP model", (_IMAGES, BINARY_FOLDER, *MODEL_FILES), MODEL_FILES[0], HEADER),
+    "nerfstudio": ("a scene", (_IMAGES, POINTS, TRANSFORMS), TRANSFORMS, json.dumps(_MADE_BY)[1:-1]),
 }
+_T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_HALF_PIXEL = 0.5  # (0.5, 0.5) is the centre of their top-left pixel
 _TAKERS = {"resolution": ("occupancy",), "dataset": tuple(_SCENES), "points": ("colmap",)}
 _RESOLUTION = 0.1  # of an occupancy grid
+_SAME_STAMP_S = 2e-3
+_SAME_PIXEL = 0.01
+_GREY = 128
 
 
 def export(
     folder: RunFolder,
-    what: What,
+    what: str,
     output: Path,
-    up: Up = "y-down",
+    up: str = "y-down",
     *,
     resolution: float | None = None,
     dataset: Path | None = None,
@@ -68,11 +88,9 @@ def export(
         What was written.
 
     Raises:
-        SlamError: an option unknown or without effect, a part that the run lacks or that is damaged, missing images,
-            or a file that cannot be written.
+        SlamError: an option without effect, a part that the run lacks or that is damaged, missing or other images, or a
+            file that cannot be written.
     """
-    if what not in get_args(What) or up not in R_UP_WORLDS:
-        raise RunError(f"what is one of {', '.join(get_args(What))}, up {' or '.join(R_UP_WORLDS)}; got {what}, {up}")
     for name, value in {"resolution": resolution, "dataset": dataset, "points": points}.items():
         if value is not None and what not in _TAKERS[name]:
             raise RunError(f"--{name} does nothing for {what}: it is for {' and '.join(_TAKERS[name])}")
@@ -84,10 +102,19 @@ def export(
     else:
         trajectory = _trajectory(folder, up)
         cloud = _map(folder, "cloud", up) if (folder.path / MAP_CLOUD).is_file() else None
-        if what == "colmap":
-            write_model(folder, output, trajectory, R_UP_WORLDS[up], cloud, dataset, points, progress)
+        without = _interpolated(folder)
+        has_images = what == "nerfstudio" or dataset is not None or folder.metrics().provenance.recording is not None
+        if has_images:
+            camera, written = _write_images(folder, output, trajectory, dataset, progress)
+            without = set(range(len(trajectory))) - set(written)
         else:
-            write_scene(folder, output, trajectory, cloud, dataset, progress)
+            logger.warning("%s does not record where its images are: the model has none; give --dataset", folder.path)
+        if what == "colmap":
+            places = Places.read(folder.require(PLACES))
+            model = _model_points(places, R_UP_WORLDS[up], cloud, points)
+            write_colmap(output, places.intrinsics, trajectory.T_world_camera, *model, without)
+        else:
+            _write_scene(output, camera, trajectory, written, cloud)
     return output
 
 
@@ -130,7 +157,7 @@ def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Pat
     return written
 
 
-def _map(folder: RunFolder, what: str, up: Up) -> Ply:
+def _map(folder: RunFolder, what: str, up: str) -> Ply:
     """The mesh or cloud of the map in the given axes."""
     ply = read_ply(folder.require(_MAPS[what]))
     if len(ply.vertices) == 0 or (ply.triangles is not None and len(ply.triangles) == 0):
@@ -138,7 +165,7 @@ def _map(folder: RunFolder, what: str, up: Up) -> Ply:
     return ply if up == "y-down" else rotated(ply, R_UP_WORLDS[up])
 
 
-def _trajectory(folder: RunFolder, up: Up) -> Trajectory:
+def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     """The optimised trajectory in the given axes."""
     folder.require(ESTIMATE)
     trajectory = folder.trajectory("optimised")
@@ -148,3 +175,126 @@ def _trajectory(folder: RunFolder, up: Up) -> Trajectory:
     if frames is not None and frames != len(trajectory):
         raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
     return replace(trajectory, T_world_camera=se3.make(R_UP_WORLDS[up], np.zeros(3)) @ trajectory.T_world_camera)
+
+
+def _model_points(
+    places: Places, R_up_world: FloatArray, cloud: Ply | None, at_most: int | None
+) -> tuple[FloatArray, NDArray[np.uint8], Sightings]:
+    """Points ``(P, 3)`` of a model and their colours: corners tracked through the images, then the cloud of the map."""
+    points, sightings = _tracked(places, at_most)
+    points = points @ R_up_world.T
+    colours = np.full((len(points), 3), _GREY, np.uint8)
+    if cloud is not None:
+        if len(points):
+            colours = cloud.colours[cKDTree(cloud.points).query(points)[1]]
+        count = len(cloud.points) if at_most is None else min(max(at_most - len(points), 0), len(cloud.points))
+        rows = np.linspace(0, len(cloud.points) - 1, count).round().astype(np.intp)
+        points = np.concatenate([points, cloud.points[rows]])
+        colours = np.concatenate([colours, cloud.colours[rows]])
+    return points, colours, sightings
+
+
+def _write_scene(
+    output: Path, camera: Intrinsics, trajectory: Trajectory, frames: list[int], cloud: Ply | None
+) -> None:
+    """Write ``points.ply`` and, last, ``transforms.json``, which tools for Gaussian splatting read.
+
+    Its cameras have OpenGL's axes: x right, y up, z backwards.
+    """
+    scene: dict[str, Any] = {
+        **_MADE_BY,
+        "camera_model": "OPENCV",
+        "fl_x": float(camera.fx),
+        "fl_y": float(camera.fy),
+        "cx": float(camera.cx) + _HALF_PIXEL,
+        "cy": float(camera.cy) + _HALF_PIXEL,
+        "w": camera.width,
+        "h": camera.height,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+    }
+    if cloud is not None:
+        write_ply(output / POINTS, cloud)
+        scene["ply_file_path"] = POINTS
+    poses = {k: (trajectory.T_world_camera[k] @ _T_CAMERA_OPENGL).tolist() for k in frames}
+    scene["frames"] = [{"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()]
+    text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
+    write_atomically(output / TRANSFORMS, lambda file: file.write_text(text, encoding="utf-8"), RunError)
+
+
+def _tracked(places: Places, at_most: int | None) -> tuple[FloatArray, Sightings]:
+    """Points of corners ``(P, 3)`` in the axes of the run, at most as many as wanted, the longest tracks first."""
+    if not places.views:
+        return np.zeros((0, 3)), Sightings.none()
+    structure = PlaceStructure(places, OF_KEYFRAMES)
+    tracks = structure.tracks()
+    length = np.bincount(tracks.point, minlength=len(tracks.points))
+    wanted = np.isfinite(tracks.points).all(axis=1)
+    chosen = np.argsort(np.where(wanted, -length, 1), kind="stable")[: int(wanted.sum())][:at_most]
+    number = np.full(len(tracks.points), -1)
+    number[chosen] = np.arange(len(chosen))
+    kept = number[tracks.point] >= 0
+    views, corners = tracks.views[kept], tracks.corners[kept]
+    pixels = structure.pixels(views, corners)
+    frames = np.array([view.index for view in places.views], np.intp)[views]
+    return tracks.points[chosen], Sightings(frames, pixels, number[tracks.point[kept]], tracks.errors_px[kept])
+
+
+def _write_images(
+    folder: RunFolder, output: Path, trajectory: Trajectory, dataset: Path | None, progress: Progress
+) -> tuple[Intrinsics, list[int]]:
+    """Write ``images/NNNNNN.png`` of all frames with a usable image; they are returned, with their camera."""
+    sequence, rows = _recording(folder, trajectory, dataset)
+    written, without = [], _interpolated(folder)
+    for k, row in enumerate(rows):
+        progress("images", k + 1, len(rows))
+        if row is None or k in without:
+            continue
+        try:
+            image = sequence.frame(row).image
+        except (SlamError, ErfsfmError):
+            continue
+        content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+        write_atomically(output / _image_name(k), partial(Path.write_bytes, data=content), RunError)
+        written.append(k)
+    if not written:
+        raise RunError(f"no image of {folder.path} can be read: check the data set")
+    if len(written) < len(rows):
+        logger.warning("%d of %d frames have no usable image: left out", len(rows) - len(written), len(rows))
+    return sequence.intrinsics, written
+
+
+def _image_name(frame: int) -> str:
+    """Of the image of a frame, seen from the scene's folder."""
+    return f"{_IMAGES}/{frame:06d}.png"
+
+
+def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:
+    """The recording of a run, and which frame of it, by its stamp, each row of the trajectory is."""
+    recorded = folder.metrics().provenance.recording
+    if recorded is None and dataset is None:
+        raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
+    recorded = recorded or {}
+    place, camera = (Path(recorded[name]) if name in recorded else None for name in ("dataset", "camera"))
+    if dataset is not None and camera is not None and not (camera.exists() or is_field_of_view(camera)):
+        camera = None  # it may have moved with the images
+    try:
+        sequence = open_sequence(dataset or place, recorded.get("sequence"), camera)
+    except (SlamError, ErfsfmError) as error:
+        raise RunError(
+            f"the images of {folder.path} are needed and not found ({error}); give --dataset ROOT"
+        ) from error
+    own = Places.read(folder.require(PLACES)).intrinsics
+    expected, found = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (own, sequence.intrinsics))
+    if not np.allclose(expected, found, atol=_SAME_PIXEL):
+        raise RunError(f"{sequence.name} has another camera than {folder.path}: give the data set of the run")
+    stamps = np.asarray(sequence.stamps)
+    nearest = nearest_stamps(trajectory.stamps, stamps)
+    same = np.abs(stamps[nearest] - trajectory.stamps) < _SAME_STAMP_S
+    if not same.any():
+        raise RunError(f"{sequence.name} has no frame at the times of {folder.path}: give the data set of the run")
+    return sequence, [row if is_same else None for row, is_same in zip(nearest.tolist(), same, strict=True)]
+
+
+def _interpolated(folder: RunFolder) -> set[int]:
+    """Frames of a run without a usable image."""
+    return {k for gap in folder.metrics().sequence.bridged or () for k in range(gap.first, gap.last + 1)}

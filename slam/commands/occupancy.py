@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from slam.formats.ply import Ply
 from slam.geometry.se3 import FloatArray
+from slam.mapping.views import moved_rows
 from slam.runtime.errors import RunError
 from slam.runtime.storage.files import write_atomically
 
@@ -182,7 +184,7 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
     Raises:
         RunError: there is no map below the cameras.
     """
-    chosen = _spread(T_world_camera, _ANCHOR_STEP * camera_height)
+    chosen = moved_rows(T_world_camera, _ANCHOR_STEP * camera_height, math.inf)
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]
     tree = cKDTree(points[:, :2])
 
@@ -235,15 +237,6 @@ def write_ros_map(
     }
     text = f"# lengths in {unit}\n" + yaml.safe_dump(description, sort_keys=False, default_flow_style=None)
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), RunError)
-
-
-def _spread(T_world_camera: FloatArray, step: float) -> list[int]:
-    """Poses at least so far from the one before."""
-    chosen = [0]
-    for k, T in enumerate(T_world_camera):
-        if np.linalg.norm(T[:3, 3] - T_world_camera[chosen[-1], :3, 3]) >= step:
-            chosen.append(k)
-    return chosen
 
 
 def _plane(points: FloatArray, start: FloatArray, tilt: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:

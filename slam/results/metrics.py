@@ -17,19 +17,8 @@ CAMERA_HEIGHTS = "camera heights"
 NO_UNIT = "no metric unit"
 
 
-class Recording(Record):
-    """Options that name the recording; none for the embedded street."""
-
-    dataset: str | None = None
-    camera: str | None = None
-    gps: str | None = None
-    sequence: str | None = None
-    frames: str | None = None
-    truth: str | None = None
-
-
 class Provenance(Record):
-    """Version, command, weights and their training data, and where depth comes from."""
+    """Version, command, weights and their training data, where depth comes from, options that name the recording."""
 
     version: str | None = None
     commit: str | None = None
@@ -43,7 +32,7 @@ class Provenance(Record):
     leak: bool | None = None
     depth_source: str | None = None
     depth_sha256: str | None = None
-    recording: Recording = part(Recording)
+    recording: dict[str, str] | None = None
 
 
 class Stretch(Record):
@@ -260,12 +249,6 @@ class Metrics(Record):
     depth_error: list[dict[str, float | None]] | None = None  # of learned depth, at some depths
     depth: DepthOfKeyframes = part(DepthOfKeyframes)
     map: MapMetrics = part(MapMetrics)
-
-    @classmethod
-    def of_begun_run(cls, provenance: Provenance) -> Metrics:
-        """Those of a run until its trajectories are whole."""
-        reason = "the run has not ended, or was killed before its trajectories were written"
-        return cls(schema_=1, status="running", reason=reason, provenance=provenance)
 
     def changed(self, **values: Any) -> Metrics:
         """With other values; None takes one out."""

@@ -14,7 +14,7 @@ from slam.runtime.errors import DownloadError, SequenceError, SlamError
 
 # of each optional extra: what needs it, its modules, and the error where one of them cannot be loaded
 EXTRAS: dict[str, tuple[str, tuple[str, ...], type[SlamError]]] = {
-    "cluster": ("several workers and schedulers need Dask", ("cloudpickle", "distributed"), SlamError),
+    "cluster": ("several workers and schedulers need Dask", ("distributed",), SlamError),
     "download": (
         "download needs remotezip and requests",
         ("remotezip", "requests", "urllib3.exceptions"),

@@ -24,9 +24,7 @@ from slam.runtime.errors import Failed
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
-columns, page, plan, work = (
-    importlib.import_module(f"benchmarking.{name}") for name in ("metrics", "page", "plan", "work")
-)
+columns, page, runs = (importlib.import_module(f"benchmarking.{name}") for name in ("metrics", "page", "runs"))
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics:
@@ -54,14 +52,14 @@ def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics
 
 @pytest.fixture
 def job(tmp_path: Path) -> Any:
-    drive = plan.BenchmarkSequence("loop 610", tmp_path / "world")
-    return plan.Job(tmp_path / "runs", drive, "sim", plan.EVERYTHING, 0)
+    drive = runs.BenchmarkSequence("loop 610", tmp_path / "world")
+    return runs.Job(tmp_path / "runs", drive, "sim", runs.EVERYTHING, 0)
 
 
 def results_of(job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
     """Results of configurations, one per seed."""
     return [
-        work.JobResult(replace(job, configuration=plan.Configuration(name), seed=seed), metrics(ate), "abc")
+        runs.JobResult(replace(job, configuration=runs.Configuration(name), seed=seed), metrics(ate))
         for name, values in ates.items()
         for seed, ate in enumerate(values)
     ]
@@ -75,8 +73,8 @@ def cells(table: str) -> list[list[str]]:
 
 def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any) -> None:
     results = results_of(job, {"default": [1.0, 3.0]})
-    results.append(work.JobResult(replace(job, seed=2), Metrics(), "abc", "out of memory"))
-    text = page.accuracy_tables(results)
+    results.append(runs.JobResult(replace(job, seed=2), Metrics(), "out of memory"))
+    text = page.error_tables(results)
     *_, head, row = cells(text)
     assert row[head.index("ATE 7-dof, optimised")] == "2.00 ± 1.41"
     assert row[head.index("scale")] == "1.100"
@@ -88,15 +86,13 @@ def test_errors_relative_to_path_and_network(job: Any) -> None:
     slower = metrics(ate=3.6).trajectories.network
     run = run.changed(trajectories=run.trajectories.model_copy(update={"network": slower}))
     definitions = columns.NETWORK_PERCENT, columns.PERCENT, columns.OF_NETWORK
-    shares = [each.value(work.JobResult(job, run, "abc")) for each in definitions]
+    shares = [each.value(runs.JobResult(job, run)) for each in definitions]
     assert shares == pytest.approx([4.0, 1.0, 0.25])
     run = run.changed(sequence=SequenceMetrics.of(length_m=Failed("no truth")))
-    assert columns.PERCENT.value(work.JobResult(job, run, "abc")) is None
+    assert columns.PERCENT.value(runs.JobResult(job, run)) is None
 
 
-@pytest.mark.parametrize(
-    ("moved_m", "turned_deg", "false"), [(0.0, 0.0, 0), (1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
-)
+@pytest.mark.parametrize(("moved_m", "turned_deg", "false"), [(1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)])
 def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float, false: int) -> None:
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
     T_world_camera[:, :3, 3] = [[0, 0, 0], [4, 0, 0], [4, 0, 7]]
@@ -106,15 +102,15 @@ def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float,
     RunFolder(tmp_path).write_metrics(metrics())
     (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
-    assert work.loops(tmp_path) == (1 - false, false)
-    work.loops.cache_clear()
+    assert runs.loops(tmp_path) == (1 - false, false)
+    runs.loops.cache_clear()
     in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
     RunFolder(tmp_path).write_metrics(in_heights)
-    assert work.loops(tmp_path) == (None, None)
+    assert runs.loops(tmp_path) == (None, None)
 
 
 def test_a_number_that_is_missing_is_named_below(job: Any) -> None:
-    text = page.maps_tables(results_of(job, {plan.EVERYTHING.name: [1.0]}))
+    text = page.maps_tables(results_of(job, {runs.EVERYTHING.name: [1.0]}))
     assert "– map triangles, loop 610: not known." in text
 
 
@@ -148,7 +144,7 @@ def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
     assert "](images/trajectories.png)" in report.read_text()
     assert cv2.imread(str(tmp_path / "images" / "trajectories.png")).std() > 0
 
-    (record,) = (tmp_path / "out" / "accuracy").glob("*sim*/record.json")
-    before = record.stat().st_mtime_ns
+    (written,) = (tmp_path / "out" / "accuracy").glob("*/*sim*/metrics.json")
+    before = written.stat().st_mtime_ns
     benchmark.main([*words, "--report", str(report)])
-    assert record.stat().st_mtime_ns == before
+    assert written.stat().st_mtime_ns == before

@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 from argparse import Namespace
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from benchmarking.metrics import FRAMES, MetricDefinition
-from benchmarking.plan import BenchmarkSequence
-from benchmarking.work import JobResult, ratio
+from benchmarking.metrics import FRAMES, MetricDefinition, share
+from benchmarking.runs import BenchmarkSequence, Job, JobResult, simulated
 
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory
@@ -20,7 +20,7 @@ from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.poses import known_poses, poses_beside
 from slam.sequences.recording import RecordedSequence
 from slam.simulation.motion import Motion
-from slam.simulation.options import VERSION, RoomHazard
+from slam.simulation.options import RoomHazard
 
 RoomCondition = Literal["clean"] | RoomHazard
 _CONDITIONS: tuple[RoomCondition, ...] = ("clean", "people", "exposure", "blur", "rolling-shutter")
@@ -62,51 +62,28 @@ def drives(options: Namespace, folder: Path) -> list[BenchmarkSequence]:
         name = root.parent.name
         found.append(BenchmarkSequence(name, root, "", kind=name, truth=poses_beside(root)))
     seeds = () if options.rooms is None else options.rooms or SEEDS
-    found += [
-        _room(folder, seed, motion, rate, hazard, options.seconds * rate)
-        for hazard in options.hazards
-        for rate in options.rates
-        for motion in options.motions
-        for seed in seeds
-    ]
+    width, height = SIZE
+    for condition, rate, motion, seed in product(options.hazards, options.rates, options.motions, seeds):
+        words = ["--route", "rooms", "--seed", str(seed), "--frames", str(options.seconds * rate), "--motion", motion]
+        words += ["--rate", str(rate), "--width", str(width), "--height", str(height)]
+        name, hazards = f"rooms {seed}, {motion}, {rate} Hz", "" if condition == "clean" else condition
+        found.append(simulated(folder, name, f"rooms, {rate} Hz", words, condition, hazards))
     return found
 
 
-def _room(
-    folder: Path, seed: int, motion: Motion, rate: int, condition: RoomCondition, frames: int
-) -> BenchmarkSequence:
-    width, height = SIZE
-    words = ["--route", "rooms", "--seed", str(seed), "--frames", str(frames), "--motion", motion, "--rate", str(rate)]
-    words += ["--width", str(width), "--height", str(height)]
-    name, kind = f"rooms {seed}, {motion}, {rate} Hz", f"rooms, {rate} Hz"
-    place = f"rooms-{seed}-{motion}-{rate}-{frames}-{condition}-v{VERSION}"
-    if condition == "clean":
-        return BenchmarkSequence(name, folder / place, simulate=tuple(words), kind=kind)
-    words += ["--hazards", condition]
-    title, kind = f"{name}, {condition}", f"{kind}, {condition}"
-    return BenchmarkSequence(title, folder / place, simulate=tuple(words), kind=kind, clean=name)
-
-
 @functools.cache
-def _error_and_path(run: Path, drive: BenchmarkSequence) -> tuple[float | None, float | None]:
+def _error_and_path(job: Job) -> tuple[float | None, float | None]:
     """7-dof ATE of the optimised trajectory, and the path, by those frames whose true pose is known, metres."""
+    drive = job.drive
     sequence = open_sequence(drive.root, drive.sequence or None, truth=drive.truth)
     poses = sequence.T_any_camera if isinstance(sequence, RecordedSequence) else None
     known = np.zeros(0, np.intp) if poses is None else np.flatnonzero(known_poses(poses))
-    estimate = RunFolder(run).trajectory("optimised")
+    estimate = RunFolder(job.place).trajectory("optimised")
     if poses is None or estimate is None or not len(known):
         return None, None
     truth = Trajectory(sequence.stamps[known], poses[known]).rebased()
     ate: float | None = trajectory_metrics(estimate.select(known).rebased(), truth).align.dof7.ate_rmse_m
     return ate, truth.length_m
-
-
-def _ate(o: JobResult) -> float | None:
-    return _error_and_path(o.job.place / "run", o.job.drive)[0] if not o.reason else None
-
-
-def _path(o: JobResult) -> float | None:
-    return _error_and_path(o.job.place / "run", o.job.drive)[1] if not o.reason else None
 
 
 def losses(o: JobResult) -> int | None:
@@ -132,16 +109,14 @@ def longest_wait(o: JobResult) -> int | None:
     return max(waits, default=None)
 
 
-ATE = MetricDefinition("ate_7dof_known_m", "ATE 7-dof (m)", _ate, 3)
-PATH = MetricDefinition("path_known_m", "path (m)", _path, 1)
-PERCENT = MetricDefinition("ate_7dof_known_percent", "7-dof, % of path", lambda o: ratio(_ate(o), _path(o), 100.0), 2)
+ATE = MetricDefinition(
+    "ate_7dof_known_m", "ATE 7-dof (m)", lambda o: None if o.reason else _error_and_path(o.job)[0], 3
+)
+PATH = MetricDefinition("path_known_m", "path (m)", lambda o: None if o.reason else _error_and_path(o.job)[1], 1)
+PERCENT = share("ate_7dof_known_percent", "7-dof, % of path", ATE, PATH, 100.0)
 LOSSES = MetricDefinition("losses", "losses", losses, 0)
 FIRST_MAP = MetricDefinition("frames_before_first_map", "frames before the first map", first_map, 0)
 NEW_MAP = MetricDefinition("frames_before_new_map", "most frames before a new map", longest_wait, 0)
-LOCATED = MetricDefinition(
-    "located_share",
-    "share of frames located",
-    lambda o: ratio(o.metrics.tracking.located_frames, FRAMES.value(o), 1.0),
-    3,
-)
+FOUND = MetricDefinition("located_frames", "located", lambda o: o.metrics.tracking.located_frames, 0)
+LOCATED = share("located_share", "share of frames located", FOUND, FRAMES, 1.0, 3)
 DEFINITIONS = (ATE, PATH, PERCENT, LOSSES, FIRST_MAP, NEW_MAP, LOCATED)

@@ -8,8 +8,7 @@ from operator import attrgetter
 from statistics import fmean, median, stdev
 from typing import Any
 
-from benchmarking.plan import slug
-from benchmarking.work import JobResult, loops, ratio
+from benchmarking.runs import JobResult, loops, ratio, revision, slug
 
 from erfsfm.common.table import DASH, Table
 
@@ -38,8 +37,11 @@ def _error(trajectory: str, alignment: str) -> MetricDefinition:
     return MetricDefinition(f"ate_{alignment}dof_{trajectory}_m", title, value, 2)
 
 
-def _share(key: str, title: str, part: MetricDefinition, whole: MetricDefinition, unit: float) -> MetricDefinition:
-    return MetricDefinition(key, title, lambda o: ratio(part.value(o), whole.value(o), unit), 2)
+def share(
+    key: str, title: str, part: MetricDefinition, whole: MetricDefinition, unit: float, decimals: int = 2
+) -> MetricDefinition:
+    """A part of a whole, in a unit."""
+    return MetricDefinition(key, title, lambda o: ratio(part.value(o), whole.value(o), unit), decimals)
 
 
 def stage_seconds(o: JobResult, stage: str) -> float | None:
@@ -56,13 +58,13 @@ _R_REL, _SCALE = (
 )
 R_REL = MetricDefinition("r_rel_deg_per_100m", "r_rel (deg / 100 m)", _R_REL, 2)
 SCALE = MetricDefinition("scale", "scale", _SCALE, 3)
-PERCENT = _share("ate_7dof_optimised_percent", "7-dof, % of path", ATE_7, LENGTH, 100.0)
-PERCENT_6 = _share("ate_6dof_optimised_percent", "6-dof, % of path", ATE_6, LENGTH, 100.0)
-NETWORK_PERCENT = _share("ate_7dof_network_percent", "network, % of path", ERRORS[0], LENGTH, 100.0)
-OF_NETWORK = _share("ate_7dof_of_network", "of network's", ATE_7, ERRORS[0], 1.0)
+PERCENT = share("ate_7dof_optimised_percent", "7-dof, % of path", ATE_7, LENGTH, 100.0)
+PERCENT_6 = share("ate_6dof_optimised_percent", "6-dof, % of path", ATE_6, LENGTH, 100.0)
+NETWORK_PERCENT = share("ate_7dof_network_percent", "network, % of path", ERRORS[0], LENGTH, 100.0)
+OF_NETWORK = share("ate_7dof_of_network", "of network's", ATE_7, ERRORS[0], 1.0)
 LOOPS = MetricDefinition("loops_accepted", "loops closed", lambda o: o.metrics.loops.accepted, 0)
-TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: loops(o.job.place / "run")[0], 0)
-FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: loops(o.job.place / "run")[1], 0)
+TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: loops(o.job.place)[0], 0)
+FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: loops(o.job.place)[1], 0)
 COVERAGE = MetricDefinition("coverage_95", "coverage of 95 %", lambda o: o.metrics.graph.coverage.inside_95, 2)
 TRIANGLES = MetricDefinition("map_triangles", "map triangles", lambda o: o.metrics.map.triangles, 0)
 MAP_ERRORS = (
@@ -83,37 +85,31 @@ MAP_SIZES = (
     MetricDefinition("map_frames_fused", "frames fused", lambda o: o.metrics.map.frames_fused, 0),
     MetricDefinition("map_floater_share", "floaters", lambda o: o.metrics.map.floater_share, 3),
 )
-FUSION = MetricDefinition(
-    "fusion_ms_per_keyframe",
-    "fusion (ms / keyframe)",
-    lambda o: ratio(stage_seconds(o, "map"), o.metrics.map.frames_fused, 1e3),
-    1,
-)
+_MAP = MetricDefinition("map_seconds", "map (s)", lambda o: stage_seconds(o, "map"), 1)
+FUSION = share("fusion_ms_per_keyframe", "fusion (ms / keyframe)", _MAP, MAP_SIZES[3], 1e3, 1)
 MESH = MetricDefinition("mesh_seconds", "mesh (s)", lambda o: stage_seconds(o, "mesh"), 1)
 RATE = MetricDefinition("frames_per_second", "frames / s", lambda o: o.metrics.timing.frames_per_second, 1)
 MEMORY = MetricDefinition("peak_rss_mb", "peak RSS (MiB)", lambda o: o.metrics.timing.peak_rss_mb, 0)
 SECONDS = MetricDefinition("seconds_total", "seconds", lambda o: o.metrics.timing.seconds_total, 1)
-COMMAND = MetricDefinition("command_seconds", "whole command (s)", lambda o: o.seconds, 1)
-LOAD = MetricDefinition("load_average", "load before", lambda o: o.load, 1)
-TIME = MetricDefinition("ms_per_frame", "ms / frame", lambda o: ratio(SECONDS.value(o), FRAMES.value(o), 1e3), 1)
-CPU = MetricDefinition(
-    "cpu_ms_per_frame", "CPU ms / frame", lambda o: ratio(o.metrics.timing.cpu_seconds, FRAMES.value(o), 1e3), 1
-)
+_CPU = MetricDefinition("cpu_seconds", "CPU s", lambda o: o.metrics.timing.cpu_seconds, 1)
+TIME = share("ms_per_frame", "ms / frame", SECONDS, FRAMES, 1e3, 1)
+CPU = share("cpu_ms_per_frame", "CPU ms / frame", _CPU, FRAMES, 1e3, 1)
 DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
 DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, TRIANGLES)
 DEFINITIONS += (*MAP_ERRORS, *MAP_SIZES[1:], FUSION, MESH)
-DEFINITIONS += (RATE, MEMORY, SECONDS, TIME, CPU, COMMAND, LOAD)
+DEFINITIONS += (RATE, MEMORY, SECONDS, TIME, CPU)
 
 
 def rows(results: Sequence[JobResult], definitions: Sequence[MetricDefinition] = ()) -> list[dict[str, Any]]:
     """One row a run for the CSV: what ran, what came out, also by more ``definitions``, seconds by stage."""
+    commit = revision()
     return [
         {
             "sequence": o.job.drive.name,
             "weights": o.job.weights,
             "configuration": o.job.configuration.name,
             "seed": o.job.seed,
-            "commit": o.commit,
+            "commit": commit,
             "status": "failed" if o.reason else "ok",
             "reason": o.reason,
             "leak": o.metrics.provenance.leak,

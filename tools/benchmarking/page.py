@@ -13,12 +13,11 @@ import numpy as np
 from benchmarking import handheld
 from benchmarking import metrics as m
 from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, kind, over_seeds, table, values, weights
-from benchmarking.plan import EVERYTHING
-from benchmarking.work import FALSE_DEG, FALSE_M, JobResult
+from benchmarking.runs import EVERYTHING, FALSE_DEG, FALSE_M, JobResult, revision
+from make_figures import draw_trajectories, trajectories_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-from shared.pictures import draw_trajectories, trajectories_of
 
 from erfsfm.common.table import DASH
 from slam.results.folder import RunFolder
@@ -39,12 +38,7 @@ PAGE = """# Benchmarks
 """
 
 
-def accuracy_tables(results: Sequence[JobResult]) -> str:
-    """The errors and a picture of every drive."""
-    return error_tables(results, f"\n\n![every drive from above]({PICTURE})" if drawable(results) else "")
-
-
-def error_tables(results: Sequence[JobResult], picture: str = "") -> str:
+def error_tables(results: Sequence[JobResult]) -> str:
     """One row for each kind of drive, then one for each sequence and weights."""
     definitions = (m.FRAMES, m.LENGTH, *m.ERRORS, m.PERCENT, m.PERCENT_6, m.OF_NETWORK, m.R_REL, m.SCALE)
     definitions += (m.LOOPS, m.FALSE_LOOPS, m.COVERAGE, m.RATE, m.MEMORY)
@@ -56,7 +50,7 @@ trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG
 
 Every drive:
 
-{table({"sequence": drive, "weights": weights}, columns, results)}{picture}{notes(results, definitions)}"""
+{table({"sequence": drive, "weights": weights}, columns, results)}{notes(results, definitions)}"""
 
 
 def maps_tables(results: Sequence[JobResult]) -> str:
@@ -113,7 +107,7 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
 
 
 TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
-    "accuracy": accuracy_tables,
+    "accuracy": error_tables,
     "full-size": error_tables,
     "maps": maps_tables,
     "handheld": handheld_tables,
@@ -135,17 +129,17 @@ def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition])
 
 def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: str) -> str:
     """A section of the page: command, commit and seeds, then its tables."""
-    commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in results))
     seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
     failed = sum(bool(o.reason) for o in results)
+    picture = f"\n\n![every drive from above]({PICTURE})" if mode == "accuracy" and drawable(results) else ""
     return f"""## {mode.capitalize()}
 
     {command}
 
-Commit {commits}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_time} at a time on
+Commit {revision()}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_time} at a time on
 {os.cpu_count()} {platform.machine()} cores.
 
-{TABLES[mode](results)}
+{TABLES[mode](results)}{picture}
 """
 
 
@@ -223,7 +217,7 @@ def draw(results: Sequence[JobResult], path: Path) -> None:
     figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
     panels = figure.subfigures(rows, columns, squeeze=False).flat
     for o, panel in zip(chosen, panels):
-        axes = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
+        axes = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place)), "")
         legend = axes.get_legend()
         if legend is not None:
             legend.remove()

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.commands.occupancy import OBSTACLE_FROM_M, OBSTACLE_TO_M, Grid, ground_along
-from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
+from slam.geometry.se3 import FloatArray, apply
+from slam.mapping.views import has_moved
 
 USUAL_CAMERA_HEIGHT_M = 1.65
 UNKNOWN = -1  # of a cell
 _LEAST_STANDING = 2  # points of a keyframe that make a cell occupied
-_TURN_RAD = np.deg2rad(15.0)
+_TURN_DEG = 15.0
 
 
 @dataclass
@@ -29,15 +30,9 @@ class LiveMap:
         chosen = []
         for frame, cloud in sorted(clouds.items()):
             last = max(self.clouds, default=None)
-            if last is not None:
-                T_last_frame = invert(T_map_camera[last]) @ T_map_camera[frame]
-                if (
-                    np.linalg.norm(T_last_frame[:3, 3]) < self.spacing
-                    and rotation_angle(T_last_frame[:3, :3]) < _TURN_RAD
-                ):
-                    continue
-            self.clouds[frame] = cloud[cloud[:, 2] <= self.depth_to]
-            chosen.append(frame)
+            if last is None or has_moved(T_map_camera[frame], T_map_camera[last], self.spacing, _TURN_DEG):
+                self.clouds[frame] = cloud[cloud[:, 2] <= self.depth_to]
+                chosen.append(frame)
         return chosen
 
     def points(self, T_map_camera: FloatArray) -> FloatArray:

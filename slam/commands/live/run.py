@@ -1,27 +1,28 @@
-"""A live run from start to end: a source in, poses out while it lasts, a run folder at its end."""
+"""A live run: frames of a source as they come, poses out while it lasts, a run folder at its end."""
 
 from __future__ import annotations
 
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from threading import Thread
+from threading import Condition, Event, Thread
 from typing import Any
 
 import numpy as np
 
 from erfsfm.common.files import FolderLock
+from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.signals import raising_on_termination
-from slam.commands.live.reader import EXPECTED, StreamedSequence
-from slam.commands.live.source import open_source
+from slam.commands.live.source import Source, open_source
 from slam.commands.run.recorder import FolderRecorder
 from slam.commands.run.request import Request
 from slam.commands.run.run import provenance_of, record
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
-from slam.frames import Intrinsics
+from slam.frames import Frame, Image, Intrinsics
 from slam.frontend.drive import Drive
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -30,16 +31,20 @@ from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.prediction.assembly import open_prediction
-from slam.results.folder import RunFolder
-from slam.results.output import check_output
+from slam.results.folder import RunFolder, check_output
 from slam.results.run_log import run_log
-from slam.runtime.errors import SlamError
+from slam.runtime.errors import SequenceError, SlamError
 from slam.runtime.imports import import_extra
 from slam.sequences.camera_file import as_known, find_camera_file
+from slam.sequences.recording import GrowingSequence
+from slam.sequences.undistortion import require_size, undistorted
 
 logger = logging.getLogger(__name__)
 
 Emit = Callable[[dict[str, Any]], None]
+_INTERRUPTED, _OVER = "it was interrupted", "the source ended"
+_LAST_IMAGE_S = 2.0
+_MOST_LATE_S = 0.15  # an image that waits is dropped for one that was taken later than this: a keyframe takes as long
 _EVERY = 6  # pixel of the depth map, and frame, whose points are shown
 _PATH = (40, 110, 240)
 _DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"
@@ -88,16 +93,109 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         viewer = Viewer(sequence.intrinsics) if request.view else None
         folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
         recorder = LiveRecorder(folder, pipeline, settings, provenance_of(request, prediction, sequence))
-        poses, reader = LivePoses(prediction.networks.sources, sequence.camera_height_m, settings), sequence.reader
+        poses = LivePoses(prediction.networks.sources, sequence.camera_height_m, settings)
         recorder.follow(sequence, poses, emit, viewer)
         try:
-            # in a thread: the reader's lock may be held by the code that is interrupted
-            record(recorder, log, ignore_signals, sequence.frames(), lambda: Thread(target=reader.stop).start())
+            # in a thread: the sequence's lock may be held by the code that is interrupted
+            record(recorder, log, ignore_signals, sequence.frames(), lambda: Thread(target=sequence.stop).start())
         except SlamError as error:
-            raise SlamError(f"{error}{_DROPPED.format(reader.dropped) if reader.dropped else ''}") from error
+            raise SlamError(f"{error}{_DROPPED.format(sequence.dropped) if sequence.dropped else ''}") from error
         finally:
-            reader.close()
+            sequence.close()
     return folder
+
+
+class StreamedSequence(GrowingSequence):
+    """The frames that were taken so far of a source, which a thread reads until it ends, dies, or sends nothing.
+
+    Attributes:
+        waiting: stamps, images, and when they came.
+        arrived_s: when the last frames came, by frame, by the monotonic clock.
+        dropped: number of images that waited, and were too old when another one came.
+        ended: why there are no more, after the last one.
+    """
+
+    def __init__(
+        self, name: str, source: Source, camera: CameraFile, most_wait_s: float, every_frame: bool = False
+    ) -> None:
+        """Prepare to read; the thread begins with the first frame.
+
+        Args:
+            name: of the sequence.
+            source: is read until it sends nothing for ``most_wait_s``.
+            camera: its calibration; images are undistorted.
+            most_wait_s: seconds.
+            every_frame: the source waits until each image was taken.
+
+        Raises:
+            SequenceError: every frame is wanted of a source that does not wait, or the camera has another image size.
+        """
+        require_size(source, camera, name)
+        if every_frame and not source.is_stored:
+            raise SequenceError(f"{name} does not wait while an image is measured: leave out --every-frame")
+        intrinsics, self._undistortion = undistorted(camera)
+        super().__init__(intrinsics, camera.height_or(None), name)
+        self.arrived_s: dict[int, float] = {}
+        self.dropped, self.ended = 0, ""
+        self._source, self._most_wait_s, self._every_frame = source, most_wait_s, every_frame
+        self.waiting: deque[tuple[float, Image, float]] = deque()
+        self._reason: str | None = None
+        self._changed, self._stopped = Condition(), Event()
+        self._thread = Thread(target=self._read, name="reader", daemon=True)
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame as it is taken."""
+        self._thread.start()
+        while (taken := self._take()) is not None:
+            index, (stamp, image, at_s) = len(self), taken
+            image = image if self._undistortion is None else self._undistortion.apply(image)
+            image.setflags(write=False)
+            self.stamps = np.append(self.stamps, stamp)
+            self.arrived_s = {k: v for k, v in self.arrived_s.items() if k >= index - 2} | {index: at_s}
+            yield Frame(index, stamp, image)
+
+    def stop(self) -> None:
+        """End after the images that wait."""
+        self._stopped.set()
+        self._end(_INTERRUPTED)
+
+    def close(self) -> None:
+        """Stop, and wait for the thread: one that still decodes an image when the process ends would abort it."""
+        self.stop()
+        if self._thread.is_alive():
+            self._thread.join(_LAST_IMAGE_S)
+
+    def _take(self) -> tuple[float, Image, float] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self.waiting or self._reason is not None, self._most_wait_s)
+            taken = self.waiting.popleft() if self.waiting else None
+            self._changed.notify()
+            if taken is None:
+                self.ended = self._reason or f"nothing came for {self._most_wait_s:g} s"
+                self._stopped.set()
+            return taken
+
+    def _read(self) -> None:
+        try:
+            for stamp, image in self._source.images(self._stopped):
+                with self._changed:
+                    if self._every_frame:
+                        self._changed.wait_for(lambda: not self.waiting or self._stopped.is_set())
+                    if self._stopped.is_set():
+                        return
+                    while self.waiting and stamp - self.waiting[0][0] > _MOST_LATE_S:
+                        self.waiting.popleft()
+                        self.dropped += 1
+                    self.waiting.append((stamp, image, time.monotonic()))
+                    self._changed.notify()
+            self._end(_OVER)
+        except SequenceError as error:
+            self._end(f"the source died: {error}")
+
+    def _end(self, reason: str) -> None:
+        with self._changed:
+            self._reason = self._reason or reason
+            self._changed.notify()
 
 
 class LiveRecorder(FolderRecorder):
@@ -111,29 +209,37 @@ class LiveRecorder(FolderRecorder):
 
     def frame(self, observer: Observer) -> None:
         """Say the poses of frames that were finished since the last call."""
-        reader = self._sequence.reader
-        if not reader.is_waiting:
+        sequence = self._sequence
+        if not sequence.waiting:
             observer.flush()
         self._say_dropped()
         for newest in self._poses.add(observer):
             index, self._said = self._said, self._said + 1
-            arrival = self._sequence.arrivals.get(index)
-            message = pose_message(index, float(self._sequence.stamps[index]), newest, self._poses.unit_name)
-            late = None if arrival is None else round(1e3 * (time.monotonic() - arrival.at_s), 1)
-            self._emit(message | {"latency_ms": late, "dropped": reader.dropped})
+            at_s = sequence.arrived_s.get(index)
+            support = None if newest.support is None else round(newest.support, 2)
+            message: dict[str, Any] = {"type": "pose", "frame": index, "stamp": float(sequence.stamps[index])}
+            message |= {"state": newest.state, "unit": self._poses.unit_name, "scale": newest.unit, "support": support}
+            message |= {"T_world_camera": newest.T_world_camera[:3].ravel().tolist()}  # row by row as in KITTI's files
+            late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
+            self._emit(message | {"latency_ms": late_ms, "dropped": sequence.dropped})
             if self._viewer is not None:
                 self._viewer.show(index, observer.drive, newest)
 
     def estimate(self, estimate: Estimate) -> None:
         """Also say all poses again as the whole drive gives them, and why it ended."""
         super().estimate(estimate)
-        reader, folder = self._sequence.reader, str(self.folder.path)
-        message = corrected_message(estimate.optimised, len(estimate.loops.accepted), estimate.scale.unit_name, folder)
-        self._emit(message | {"dropped": reader.dropped, "ended": reader.ended})
+        sequence, trajectory, loops = self._sequence, estimate.optimised, len(estimate.loops.accepted)
+        state = "loop closed" if loops else "whole drive"
+        message: dict[str, Any] = {"type": "trajectory", "state": state, "loops": loops}
+        message |= {"unit": estimate.scale.unit_name, "run": str(self.folder.path)}
+        poses = trajectory.T_world_camera[:, :3].reshape(-1, 12).tolist()
+        message |= {"stamps": trajectory.stamps.tolist(), "T_world_camera": poses}
+        self._emit(message | {"dropped": sequence.dropped, "ended": sequence.ended})
         if self._viewer is not None:
-            self._viewer.correct(estimate.optimised)
-        (logger.warning if reader.dropped else logger.info)("%d images were dropped", reader.dropped)
-        (logger.info if reader.ended in EXPECTED else logger.warning)("the stream ended: %s", reader.ended)
+            self._viewer.correct(trajectory)
+        (logger.warning if sequence.dropped else logger.info)("%d images were dropped", sequence.dropped)
+        is_expected = sequence.ended in (_INTERRUPTED, _OVER)
+        (logger.info if is_expected else logger.warning)("the stream ended: %s", sequence.ended)
 
     def leave(self) -> None:
         """The poses so far, which nothing else could give again."""
@@ -144,7 +250,7 @@ class LiveRecorder(FolderRecorder):
 
     def _say_dropped(self) -> None:
         """Once a second, while more images are dropped."""
-        dropped, now_s = self._sequence.reader.dropped, time.monotonic()
+        dropped, now_s = self._sequence.dropped, time.monotonic()
         if dropped > self._dropped and now_s - self._dropped_said_s >= 1.0:
             self._dropped, self._dropped_said_s = dropped, now_s
             logger.warning("%d images dropped, %d measured", dropped, len(self._sequence))
@@ -189,20 +295,3 @@ class Viewer:
         """The path of the whole drive, with its loops closed."""
         self._stream.log("world/path", self._rr.LineStrips3D([trajectory.positions], colors=[(20, 160, 60)]))
         self._stream.flush()
-
-
-def pose_message(index: int, stamp: float, newest: LivePose, unit: str | None) -> dict[str, Any]:
-    """One frame: its pose ``(4, 4)`` as 12 numbers, row by row as in KITTI's files."""
-    pose = [float(x) for x in newest.T_world_camera[:3].ravel()]
-    support = None if newest.support is None else round(newest.support, 2)
-    known = {"unit": unit, "scale": newest.unit, "support": support}
-    return {"type": "pose", "frame": index, "stamp": stamp, "state": newest.state, **known, "T_world_camera": pose}
-
-
-def corrected_message(trajectory: Trajectory, loops: int, unit: str | None, run: str) -> dict[str, Any]:
-    """All poses after the whole drive was solved, with its loops closed."""
-    poses = [[float(x) for x in T[:3].ravel()] for T in trajectory.T_world_camera]
-    state = "loop closed" if loops else "whole drive"
-    stamps = [float(stamp) for stamp in trajectory.stamps]
-    content = {"type": "trajectory", "state": state, "loops": loops, "unit": unit, "run": run}
-    return content | {"stamps": stamps, "T_world_camera": poses}

@@ -17,20 +17,20 @@ from slam.mapping.filters import KeyframeDepth
 from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
-from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
-from slam.results.map_error import map_errors
 from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
 from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.truth import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, SlamError, attempt
 from slam.runtime.run_files import CONFIG, GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
 from slam.runtime.storage.files import from_anywhere
 
 logger = logging.getLogger(__name__)
 
+_BEGUN = "the run has not ended, or was killed before its trajectories were written"
 _NO_KEYFRAMES = "no frame for the map has depth"
 
 
@@ -48,7 +48,7 @@ class FolderRecorder(Recorder):
         """Prepare to write what a pipeline gives."""
         self.folder, self.pipeline = folder, pipeline
         self._settings, self._provenance, self._progress = settings, provenance, progress
-        self._metrics = Metrics.of_begun_run(provenance)
+        self._metrics = Metrics(schema_=1, status="running", reason=_BEGUN, provenance=provenance)
 
     def begin(self) -> None:
         """The metrics and settings of a run that begins; the source of depth by its whole path."""

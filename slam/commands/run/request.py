@@ -9,11 +9,12 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from erfsfm.common.config_tree import Section, first_problem
 from erfsfm.common.progress import Progress, silent
-from slam.results.metrics import Recording
 from slam.runtime.errors import RunError
 from slam.runtime.storage.files import from_anywhere
 
 NameOrPath = Annotated[str, BeforeValidator(lambda given: str(given) if isinstance(given, Path) else given)]
+
+_RECORDING = ("dataset", "camera", "gps", "sequence", "frames", "truth")
 
 
 class Request(Section):
@@ -49,16 +50,11 @@ class Request(Section):
             raise RunError(f"run_slam: {first_problem(error)}") from error
 
     @property
-    def recording(self) -> Recording:
-        """The options that name the recording, files by their whole paths."""
-        given = {name: getattr(self, name, None) for name in Recording.names()}
-        return Recording.of(
-            **{
-                name: from_anywhere(value) if name == "dataset" or isinstance(value, Path) else value
-                for name, value in given.items()
-                if value is not None
-            }
-        )
+    def recording(self) -> dict[str, str]:
+        """The options that name the recording, files by their whole paths; none of the embedded street."""
+        given = {name: getattr(self, name, None) for name in _RECORDING}
+        named = {name: value for name, value in given.items() if value is not None}
+        return {name: from_anywhere(v) if name == "dataset" or isinstance(v, Path) else v for name, v in named.items()}
 
 
 class RunRequest(Request):

@@ -23,9 +23,8 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline
 from slam.prediction.assembly import Prediction, open_prediction
 from slam.prediction.depth_folder import FrameNumbers
-from slam.results.folder import RunFolder
+from slam.results.folder import RunFolder, check_output
 from slam.results.metrics import Provenance
-from slam.results.output import check_output
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog, run_log
 from slam.runtime.imports import import_extra

@@ -48,11 +48,6 @@ class Picture:
     plot: str = ""
     reason: str = ""
 
-    @classmethod
-    def of_file(cls, title: str, caption: str, content: bytes, kind: str) -> Picture:
-        """A file of a ``kind`` such as png."""
-        return cls(title, caption, image=f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}")
-
 
 def write_report(
     folder: RunFolder,

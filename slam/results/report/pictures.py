@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Sequence
 
 import cv2
@@ -41,7 +42,7 @@ class DepthPictures:
             learned = each.depth if each.network_depth is None else each.network_depth
             depths = [learned] if each.relative_sigma is None else [learned, each.depth]
             strip = np.hstack([each.image, colour_disparity(np.hstack(depths))])
-            found.append(_picture(_narrow(strip, _WIDTH_PX * (1 + len(depths))), f"Frame {each.frame}"))
+            found.append(_picture(narrowed(strip, _WIDTH_PX * (1 + len(depths))), f"Frame {each.frame}"))
         return found
 
 
@@ -68,7 +69,7 @@ def loop_pictures(loops: Sequence[Loop], image: Callable[[int], Image | None], i
 def _joined(first: Image, second: Image, ends: NDArray[np.floating]) -> Image:
     """Both images, wide ones below each other, with a line for every corner ``(M, 2, 2)``, some of very many."""
     wide = first.shape[1] > 2 * first.shape[0]
-    left, right = _narrow(first, _WIDTH_PX), _narrow(second, _WIDTH_PX)
+    left, right = narrowed(first, _WIDTH_PX), narrowed(second, _WIDTH_PX)
     joined = np.ascontiguousarray(np.vstack([left, right]) if wide else np.hstack([left, right]))
     shift = np.array([[0, 0], [0, left.shape[0]] if wide else [_WIDTH_PX, 0]])
     ends = (ends + shift)[:: max(1, -(-len(ends) // _MOST_LINES))]
@@ -79,7 +80,8 @@ def _joined(first: Image, second: Image, ends: NDArray[np.floating]) -> Image:
     return joined
 
 
-def _narrow(image: Image, width: int) -> Image:
+def narrowed(image: Image, width: int) -> Image:
+    """An image at another width."""
     height = max(round(image.shape[0] * width / image.shape[1]), 1)
     method = cv2.INTER_AREA if width < image.shape[1] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, (width, height), interpolation=method), np.uint8)
@@ -87,4 +89,4 @@ def _narrow(image: Image, width: int) -> Image:
 
 def _picture(image: Image, title: str) -> Picture:
     _, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return Picture.of_file(title, title, content.tobytes(), "jpeg")
+    return Picture(title, title, f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode('ascii')}")

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.commands.live.reader import StreamedSequence
+from slam.commands.evaluation import compare
+from slam.commands.live.run import StreamedSequence
 from slam.commands.live.source import FolderSource
 from slam.formats.trajectory import read_trajectory
-from slam.results.systems import compare
 from slam.runtime.errors import SlamError
 from slam.sequences.camera_file import explicit_camera
 from slam.sequences.catalogue import open_sequence

@@ -33,7 +33,7 @@ def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path
 def begin(output: Path) -> RunFolder:
     """A new run into ``output``, before it has a trajectory."""
     folder = RunFolder.create(output, output.parent, "sim")
-    folder.write_metrics(Metrics.of_begun_run(Provenance(weights_sha256="00")))
+    folder.write_metrics(Metrics(schema_=1, status="running", provenance=Provenance(weights_sha256="00")))
     return folder
 
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from slam.geometry import se3
-from slam.results.map_error import DepthTruth, find_truth
+from slam.results.truth import DepthTruth, find_truth
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root

@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live.reader import Reader
-from slam.commands.live.run import LiveRequest, run_live
+from slam.commands.live.run import LiveRequest, StreamedSequence, run_live
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
+from slam.sequences.camera_file import explicit_camera
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
 FRAMES = 14
@@ -49,30 +49,30 @@ def request_of(source: Path | str, weights: Path, settings: Sequence[str], outpu
     return LiveRequest(dataset=str(source), output=output, weights=str(weights), overrides=list(settings), **options)
 
 
-def fill(source: Path, target: Path, messages: list[dict[str, Any]], vanishes: bool = True) -> None:
-    """Put an image into a folder each time the one before was answered; after the last, take the folder away."""
-    names = sorted(path.name for path in source.iterdir())
+def filled(
+    street: Path, tmp_path: Path, frames: int = FRAMES, broken: dict[int, bytes] | None = None, vanishes: bool = True
+) -> tuple[Path, list[dict[str, Any]]]:
+    """A folder beside its camera file, and the list of messages that it is filled by.
+
+    An image comes each time the one before was answered, ``broken`` ones at once; after the last, the folder vanishes.
+    """
+    target, messages, broken = tmp_path / "images", [], broken or {}
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    contents = dict(enumerate(path.read_bytes() for path in sorted((street / "images").iterdir())[:frames])) | broken
 
     def run() -> None:
-        for answered, name in enumerate(names, start=1):
-            partial = target / f".{name}.partial"
-            shutil.copy(source / name, partial)
-            partial.rename(target / name)
+        answered = 0
+        for number, content in contents.items():
+            (target / ".partial").write_bytes(content)
+            (target / ".partial").rename(target / f"{number:06d}.png")
+            answered += number not in broken
             while len(messages) < answered:
                 time.sleep(0.01)
         if vanishes:
             target.rename(target.with_name("unplugged"))
 
     Thread(target=run, daemon=True).start()
-
-
-def filled(street: Path, tmp_path: Path) -> tuple[Path, list[dict[str, Any]]]:
-    """A folder beside its camera file that `fill` fills, and the messages that it waits for."""
-    target: Path = tmp_path / "images"
-    messages: list[dict[str, Any]] = []
-    target.mkdir()
-    shutil.copy(street / "camera.yaml", tmp_path)
-    fill(street / "images", target, messages)
     return target, messages
 
 
@@ -118,24 +118,9 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
 def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_run(
     street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    target, messages = tmp_path / "images", []
-    target.mkdir()
-    shutil.copy(street / "camera.yaml", tmp_path)
-    contents = [path.read_bytes() for path in sorted((street / "images").iterdir())]
-    contents[5] = contents[5][:2000]
-    contents[8] = cv2.imencode(".png", np.zeros((20, 30, 3), np.uint8))[1].tobytes()
-
-    def fill_and_vanish() -> None:
-        answered = 0
-        for number, content in enumerate(contents):
-            (target / ".partial").write_bytes(content)
-            (target / ".partial").rename(target / f"{number:06d}.png")
-            answered += number not in (5, 8)
-            while len(messages) < answered:
-                time.sleep(0.01)
-        target.rename(tmp_path / "unplugged")
-
-    Thread(target=fill_and_vanish, daemon=True).start()
+    cut = sorted((street / "images").iterdir())[5].read_bytes()[:2000]
+    small = cv2.imencode(".png", np.zeros((20, 30, 3), np.uint8))[1].tobytes()
+    target, messages = filled(street, tmp_path, broken={5: cut, 8: small})
     request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     *poses, last = messages
@@ -163,10 +148,6 @@ def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wante
     ("settings", "words"),
     [
         (("scale.mode=camera-height",), "scale mode camera-height needs a known height; images has none"),
-        (
-            ("scale.mode=known", "scale.known_m=1", "scale.known_between=[0,1]"),
-            "known needs frames of a whole sequence",
-        ),
         (("lidar.factors=true",), r"lidar\.factors=true needs LiDAR scans of neighbouring frames"),
     ],
 )
@@ -187,13 +168,7 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
     street: Path, tiny_weights: Path, tmp_path: Path, frames: int
 ) -> None:
     """After the last of two frames, which are too few, and at the ninth, which nobody listens to."""
-    taken, target, messages = tmp_path / "taken", tmp_path / "images", []
-    taken.mkdir()
-    target.mkdir()
-    shutil.copy(street / "camera.yaml", tmp_path)
-    for path in sorted((street / "images").iterdir())[:frames]:
-        shutil.copy(path, taken)
-    fill(taken, target, messages)
+    target, messages = filled(street, tmp_path, frames)
 
     def listen(message: dict[str, Any]) -> None:
         messages.append(message)
@@ -216,7 +191,7 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
 class Scripted:
     """A source of small images that calls ``before`` with the number of each, and may die after the last one."""
 
-    width, height, fps, is_stored = 8, 6, 10.0, False
+    width, height, fps, is_stored = 8, 8, 10.0, False
 
     def __init__(self, images: int, before: Callable[[int], object], dies: bool = False) -> None:
         self._images, self._before, self._dies, self.is_over = images, before, dies, Event()
@@ -224,41 +199,50 @@ class Scripted:
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
         for number in range(self._images):
             self._before(number)
-            yield 0.1 * number, np.full((6, 8, 3), number, np.uint8)
+            yield 0.1 * number, np.full((8, 8, 3), number, np.uint8)
         self.is_over.set()
         if self._dies:
             raise SequenceError("the cable was pulled")
+
+
+def streamed(source: Scripted, wait_s: float = 60.0, every_frame: bool = False) -> StreamedSequence:
+    camera = explicit_camera(Path("fov=70"), source)
+    return StreamedSequence("scripted", source, camera, wait_s, every_frame)
 
 
 def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
     """While we are busy with the first of 51 images, all others come; the last two of them wait."""
     first_is_taken = Event()
     source = Scripted(51, lambda number: number and first_is_taken.wait())
-    reader, taken = Reader(source, 60.0, lambda image: image), []
-    for arrival in reader:
-        taken.append(int(arrival.image[0, 0, 0]))
+    sequence, taken = streamed(source), []
+    for frame in sequence.frames():
+        taken.append(int(frame.image[0, 0, 0]))
         first_is_taken.set()
         source.is_over.wait()
-    assert taken == [0, 49, 50] and reader.dropped == 48 and reader.ended == "the source ended"
+    assert taken == [0, 49, 50] and sequence.dropped == 48 and sequence.ended == "the source ended"
 
 
 def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:
-    reader = Reader(Scripted(20, lambda number: None), 60.0, lambda image: image, every_frame=True)
-    taken = []
-    for arrival in reader:
-        taken.append(int(arrival.image[0, 0, 0]))
+    source = Scripted(20, lambda number: None)
+    source.is_stored = True
+    sequence, taken = streamed(source, every_frame=True), []
+    for frame in sequence.frames():
+        taken.append(int(frame.image[0, 0, 0]))
         time.sleep(0.001)
-    assert taken == list(range(20)) and reader.dropped == 0 and reader.ended == "the source ended"
+    assert taken == list(range(20)) and sequence.dropped == 0 and sequence.ended == "the source ended"
 
 
 def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
     released = Event()
-    stalls = Reader(Scripted(2, lambda number: number and released.wait()), 0.2, lambda image: image)
-    assert len(list(stalls)) == 1 and stalls.ended == "nothing came for 0.2 s"
+    stalls = streamed(Scripted(2, lambda number: number and released.wait()), 0.2)
+    assert len(list(stalls.frames())) == 1 and stalls.ended == "nothing came for 0.2 s"
     released.set()
     first_is_taken = Event()
-    dies = Reader(Scripted(2, lambda number: number and first_is_taken.wait(), dies=True), 60.0, lambda image: image)
-    assert len([first_is_taken.set() for _ in dies]) == 2 and dies.ended == "the source died: the cable was pulled"
+    dies = streamed(Scripted(2, lambda number: number and first_is_taken.wait(), dies=True))
+    assert (
+        len([first_is_taken.set() for _ in dies.frames()]) == 2
+        and dies.ended == "the source died: the cable was pulled"
+    )
 
 
 @pytest.fixture
@@ -339,11 +323,9 @@ def test_the_viewer_is_shown_the_drive(
 ) -> None:
     """What it would show goes to a file, as it does without a screen."""
     rerun = pytest.importorskip("rerun", reason="the extra rerun is not installed")
-    shown, target, messages = tmp_path / "shown.rrd", tmp_path / "images", []
+    shown = tmp_path / "shown.rrd"
     monkeypatch.setattr(rerun.RecordingStream, "spawn", lambda stream: stream.save(shown))
-    target.mkdir()
-    shutil.copy(street / "camera.yaml", tmp_path)
-    fill(street / "images", target, messages)
+    target, messages = filled(street, tmp_path)
     settings, output = SETTINGS[1:], tmp_path / "run"  # keyframes are kept for the map
     request = request_of(target, tiny_weights, settings, output, wait=600, view=True)
     run_live(request, messages.append)
@@ -402,9 +384,8 @@ def test_sources_that_are_not_there(tmp_path: Path) -> None:
     "number", [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP))]
 )
 def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path, number: signal.Signals) -> None:
-    output, target, messages = tmp_path / "run", tmp_path / "images", []
-    target.mkdir()
-    fill(street / "images", target, messages, vanishes=False)
+    output = tmp_path / "run"
+    target, messages = filled(street, tmp_path, vanishes=False)
     command = [sys.executable, "-m", "slam", "live", "--dataset", str(target), "--output", str(output), "--wait", "600"]
     command += ["--camera", str(street / "camera.yaml")]
     command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]

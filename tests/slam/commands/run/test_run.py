@@ -1,19 +1,29 @@
-"""Whole runs from a data set and weights to a run folder, with untrained networks."""
+"""Whole runs with untrained networks; however one ends, its files are whole, and what it left can be used."""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import re
+import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from safetensors.torch import load_file, save_file
 
+from erfsfm.common.errors import BusyError
 from erfsfm.common.signals import Terminated
 from slam import run_slam
+from slam.commands.cli import main
+from slam.commands.run.recorder import FolderRecorder
+from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
@@ -42,7 +52,7 @@ def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any
         f"output.root={tmp_path / 'results'}",
         NO_REPORT,
     ]
-    return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:6"}
+    return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:8"}
 
 
 @pytest.fixture
@@ -85,18 +95,6 @@ def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> Non
     assert numbers["network"]["snippet5"]["ate_mean"] > 0
 
 
-def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], tmp_path: Path) -> None:
-    output = tmp_path / "mine"
-    run_slam(**quick, output=output)
-    (output / "map_mesh.ply").write_text("of an older run")
-    (output / "notes.txt").write_text("what I saw")
-    run_slam(**quick | {"frames": "0:7"}, output=output)
-    assert RunFolder.open(output).metrics().tree()["sequence"]["frames"] == 7
-    assert not (output / "map_mesh.ply").exists()
-    assert (output / "notes.txt").read_text() == "what I saw"
-    assert not (tmp_path / "results").exists()
-
-
 def test_without_map_and_truth_the_reasons_are_written(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
 ) -> None:
@@ -125,6 +123,8 @@ def test_a_run_that_fails_says_why_and_keeps_what_it_has(
     assert ">FAILED<" in report and "000003.png is truncated" in report
     assert "the run failed" in (output / "run.log").read_text()
     assert yaml.safe_load((output / "config.yaml").read_text())["mapping"]["enabled"] is False
+    assert not any(path.name.startswith("trajectory") for path in output.iterdir())
+    assert run_slam(**reported, output=output).metrics().status == "ok"
 
 
 def test_an_unreadable_image_is_bridged_and_reported(
@@ -192,11 +192,193 @@ def test_an_untrained_pose_network_with_two_sources_runs(
     reported: dict[str, Any], tmp_path: Path, write_weights: Callable[..., Path], check_run: CheckRun
 ) -> None:
     metrics = check_run(run_slam(**reported | {"weights": write_weights(tmp_path / "three", sources=2)}).path)
-    assert metrics["trajectories"]["network"]["snippet5"]["count"] == 2
+    assert metrics["trajectories"]["network"]["snippet5"]["count"] == 4
 
 
-def test_impossible_runs_make_no_folder(quick: dict[str, Any], tmp_path: Path) -> None:
-    for wish in ({"sequence": "09"}, {"frames": "0:99"}, {"overrides": ["map.enabled=false"]}):
-        with pytest.raises(SlamError):
-            run_slam(**quick | wish, output=tmp_path / "none")
-    assert not (tmp_path / "none").exists()
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def call(*arguments: object) -> int:
+    """Exit code of ``erfsfm-slam ARGUMENTS``."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:
+        patch.setattr(sys, "argv", ["erfsfm-slam", *map(str, arguments)])
+        main()
+    return int(stopped.value.code or 0)
+
+
+def test_an_unknown_argument_is_named() -> None:
+    with pytest.raises(TypeError, match="sped"):
+        run_slam(**{"sped": 3})  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("option", [{"seed": -1}, {"frames": 8}, {"overrides": "a=b"}, {"progress": 5}])
+def test_an_argument_of_another_kind_is_named(quick: dict[str, Any], option: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=f"run_slam: {next(iter(option))}: "):
+        run_slam(**quick | {"output": tmp_path / "run"} | option)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_of_another_program_is_refused_before_any_work(quick: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("mine")
+    with pytest.raises(RunError, match="not empty and holds no run"):
+        run_slam(**quick | {"weights": tmp_path / "nowhere"}, output=tmp_path)
+    assert contents(tmp_path) == {"config.yaml": b"mine"}
+
+
+def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str, Any], tmp_path: Path) -> None:
+    output = tmp_path / "run"
+    run_slam(**quick, output=output)
+    before = contents(output)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "model.yaml").write_text("{")
+    shutil.copytree(quick["weights"], tmp_path / "infinite")
+    tensors = load_file(tmp_path / "infinite" / "pose.safetensors")
+    next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] = float("nan")
+    save_file(tensors, tmp_path / "infinite" / "pose.safetensors")
+    for wish in (
+        {"weights": tmp_path / "infinite"},
+        {"frames": "0:2"},
+        {"overrides": ["scale.mode=lidar"]},
+        {"weights": tmp_path / "weights"},
+        {"dataset": tmp_path / "nowhere"},
+        {"overrides": ["map.nope=1"]},
+    ):
+        with pytest.raises(Exception, match=r".") as raised:
+            run_slam(**quick | wish, output=output)
+        assert "\n" not in str(raised.value)
+        assert contents(output) == before
+
+
+@pytest.mark.parametrize("stage", ["loops", "graph", "map", "report"])
+def test_a_stage_that_fails_costs_its_results(
+    stage: str,
+    quick: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise KeyError(0)
+
+    place = {
+        "loops": "slam.pipeline.run.close_loops",
+        "graph": "slam.graph.pose_graph.PoseGraph.optimise",
+        "map": "slam.pipeline.run.SlamPipeline.fuse",
+        "report": "slam.commands.run.recorder.write_report",
+    }
+    monkeypatch.setattr(place[stage], failing)
+    words = ["--dataset", quick["dataset"], "--weights", quick["weights"], "--frames", "0:8"]
+    assert call("run", *words, "--set", "visual_odometry.enabled=false", "--output", tmp_path / "run") == 0
+    assert "failed: unexpected KeyError: 0 (test_run.py:" in caplog.text
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["status"] == "ok" and metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+    lost = {
+        "loops": [("loops", "accepted")],
+        "graph": [("loops", "accepted"), ("graph", "nodes")],
+        "map": [("map", "triangles")],
+    }
+    for part, name in lost.get(stage, []):
+        assert metrics[part][name] is None and "KeyError" in metrics[part][f"{name}_reason"]
+    assert (tmp_path / "run/report.html").is_file() == (stage != "report")
+    assert (tmp_path / "run/graph.g2o").is_file() == (stage != "graph")
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_during_the_pass_leaves_a_whole_run_of_what_was_seen(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    def interrupted(self: FolderRecorder, observer: Observer) -> None:
+        if observer.frames == 6:
+            os.kill(os.getpid(), getattr(signal, name))
+
+    monkeypatch.setattr(FolderRecorder, "frame", interrupted)
+    folder = run_slam(**quick, output=tmp_path / "run")
+    metrics = folder.metrics()
+    assert (metrics.status, metrics.sequence.frames) == ("ok", 6)
+    assert "the first 6 of 8 frames" in caplog.text
+    assert all(len(folder.trajectory(each) or ()) == 6 for each in ("network", "optimised", "reference"))
+
+
+def test_a_signal_before_the_first_snippet_ends_a_run(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FolderRecorder, "frame", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(SlamError, match="interrupted after 1 frames"):
+        run_slam(**quick, output=tmp_path / "run")
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_terminated_run_has_its_reason(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def terminated(self: SlamPipeline, *_: object) -> None:
+        os.kill(os.getpid(), getattr(signal, name))
+
+    monkeypatch.setattr(SlamPipeline, "fuse", terminated)
+    with pytest.raises(Terminated) as raised:
+        run_slam(**quick, output=tmp_path / "run")
+    assert raised.value.code == 128 + getattr(signal, name)
+    metrics = RunFolder.open(tmp_path / "run").metrics().tree()
+    assert (metrics["status"], metrics["reason"]) == ("failed", f"ended by {name}")
+    assert metrics["trajectories"]["optimised"]["align"] and metrics["map"] is None
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from slam import run_slam
+from slam.pipeline.run import SlamPipeline
+
+def kill(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+SlamPipeline.fuse = kill
+root, weights, output = sys.argv[1:]
+run_slam(root, "sim", weights=weights, output=Path(output), frames="0:8", overrides=["visual_odometry.enabled=false"])
+"""
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_in_its_map_can_be_used_and_replaced(
+    quick: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    output = tmp_path / "run"
+    arguments = [str(quick["dataset"]), str(quick["weights"]), str(output)]
+    assert subprocess.run([sys.executable, "-c", KILLED, *arguments], check=False).returncode == -signal.SIGKILL
+    assert RunFolder.open(output).metrics().tree()["status"] == "estimated"
+    images = quick["dataset"] / "sequences" / "sim" / "image_2"
+    run = ("run", "--dataset", quick["dataset"], "--weights", quick["weights"], "--set", "mapping.enabled=false")
+    for numbers in ("estimated", "running", "absent"):
+        if numbers == "running":
+            (output / "metrics.json").write_text(
+                '{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}'
+            )
+        elif numbers == "absent":
+            (output / "metrics.json").unlink()
+        caplog.clear()
+        capsys.readouterr()
+        assert call("evaluate", output, "--json") == 0
+        assert caplog.text.count("\n") == 1 and "files that are there are whole" in caplog.text
+        (entry,) = json.loads(capsys.readouterr().out)
+        assert entry["status"] != "ok"
+        if numbers == "estimated":
+            assert entry["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+    assert call("localize", images / "000003.png", "--map", output) == 0
+    (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}')
+    assert call(*run, "--frames", "0:8", "--output", output) == 0
+    assert RunFolder.open(output).metrics().tree()["status"] == "ok"
+
+
+def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path) -> None:
+    output, refused = tmp_path / "run", []
+
+    def second(*_: object) -> None:
+        if not refused:
+            with pytest.raises(BusyError, match="another process writes to") as error:
+                run_slam(**quick, output=output)
+            refused.append(error)
+
+    run_slam(**quick, output=output, progress=second)
+    assert len(refused) == 1 and RunFolder.open(output).metrics().tree()["status"] == "ok"
+    assert run_slam(**quick, output=output).metrics().tree()["status"] == "ok"

@@ -169,10 +169,8 @@ def test_live_sessions_take_a_network_and_refuse_folders(
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("onnx", "'depth.source' in --set depth.source=onnx should be network, onnx:FILE, npy:FOLDER or png:FOLDER"),
         ("tiff:depth", "should be network, onnx:FILE, npy:FOLDER or png:FOLDER; got 'tiff:depth'"),
         ("onnx:gone.onnx", "cannot read gone.onnx"),
-        ("npy:gone", "no depth folder gone"),
         ("npy:short", "short has 23 frames of .npy"),
         ("npy:pickled", "pickled/000005.npy holds Python objects, which are not loaded"),
         ("npy:unknown", "frames 0 to 4 have no known depth in npy:unknown"),

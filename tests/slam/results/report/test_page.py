@@ -74,7 +74,7 @@ def values(packed: dict[str, str], kind: str) -> np.ndarray:
 @pytest.fixture
 def full(make_run: MakeRun, view: MapView) -> RunFolder:
     folder = make_run()
-    strip = Picture.of_file("Frame 10", "Frame 10", b"a picture", "jpeg")
+    strip = Picture("Frame 10", "Frame 10", "data:image/jpeg;base64,YSBwaWN0dXJl")
     write_report(folder, [strip], [], view)
     return folder
 

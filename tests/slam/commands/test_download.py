@@ -198,6 +198,15 @@ def test_no_server_at_all(download: Call, mirror: str, message: str) -> None:
     assert code == 1 and re.search(message, err) and len(err.splitlines()) == 1, err
 
 
+def test_bytes_that_do_not_fit_their_crc_are_not_kept(tmp_path: Path, server: Server, download: Call) -> None:
+    data = server.files["data_odometry_color.zip"]
+    start = data.index(b"dataset/sequences/09/image_2/000000.png") + 60
+    server.files["data_odometry_color.zip"] = data[:start] + bytes(200) + data[start + 200 :]
+    code, _, err = download(*KITTI)
+    assert code == 1 and "000000.png broke off (BadZipFile: Bad CRC-32" in err
+    assert "dataset/sequences/09/image_2/000000.png" not in found(tmp_path / "to")
+
+
 def test_members_that_lead_out_of_the_folder_are_refused(tmp_path: Path, server: Server, download: Call) -> None:
     server.files["data_odometry_color.zip"] = zipped({"dataset/sequences/09/image_2/../../../../../out.png": b"x"})
     code, _, err = download(*KITTI)

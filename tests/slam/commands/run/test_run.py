@@ -226,6 +226,45 @@ def test_a_folder_of_another_program_is_refused_before_any_work(quick: dict[str,
     assert contents(tmp_path) == {"config.yaml": b"mine"}
 
 
+def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], tmp_path: Path) -> None:
+    output = tmp_path / "mine"
+    run_slam(**quick, output=output)
+    (output / "map_mesh.ply").write_text("of an older run")
+    (output / "notes.txt").write_text("what I saw")
+    run_slam(**quick | {"frames": "0:7"}, output=output)
+    assert RunFolder.open(output).metrics().tree()["sequence"]["frames"] == 7
+    assert not (output / "map_mesh.ply").exists()
+    assert (output / "notes.txt").read_text() == "what I saw"
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_data_set_is_no_place_for_a_run(quick: dict[str, Any], copy_of_kitti_root: CopyRoot) -> None:
+    root = copy_of_kitti_root()
+    before = contents(root)
+    with pytest.raises(RunError, match="not empty and holds no run"):
+        run_slam(**quick | {"dataset": root}, output=root)
+    assert contents(root) == before
+
+
+def test_a_run_that_breaks_off_has_its_reason_and_is_replaced(
+    quick: dict[str, Any], copy_of_kitti_root: CopyRoot, tmp_path: Path
+) -> None:
+    output, root = tmp_path / "run", copy_of_kitti_root()
+    run_slam(**quick, output=output)
+    before = contents(output)
+    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
+        image.write_bytes(b"no image")
+    with pytest.raises(SlamError, match=r"000003\.png"):
+        run_slam(**quick | {"dataset": root}, output=output)
+    after = contents(output)
+    assert not any(name.startswith("trajectory") for name in after)
+    broken = json.loads(after["metrics.json"])
+    assert broken["status"] == "failed" and "000003.png" in broken["reason"]
+    assert b"the run failed" in after["run.log"]
+    assert run_slam(**quick | {"frames": "0:9"}, output=output).metrics().tree()["sequence"]["frames"] == 9
+    assert set(contents(output)) == set(before)
+
+
 def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str, Any], tmp_path: Path) -> None:
     output = tmp_path / "run"
     run_slam(**quick, output=output)

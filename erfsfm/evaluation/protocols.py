@@ -28,7 +28,7 @@ from erfsfm.evaluation.depth_metrics import (
     standard_error,
 )
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
-from erfsfm.evaluation.streets import find_streets
+from erfsfm.evaluation.streets import Street, find_streets
 
 _BASELINE = "median depth map"
 _PICTURE_WIDTH = 620
@@ -82,26 +82,13 @@ def depth_protocol(
         name: [refuse_leak(each, street.seen, allow_leak) for street in streets] for name, each in networks.items()
     }
     total, done = sum(len(street.frames) for street in streets), 0
-    errors: dict[str, list[list[DepthErrors]]] = {name: [[] for _ in streets] for name in (*networks, _BASELINE)}
-    for place, street in enumerate(streets):
-        for load in street.frames:
-            progress("depth", done, total)
-            image, truth = load()
-            guesses = {name: each.depth(image) for name, each in networks.items()}
-            if pictures is not None and load is street.frames[0]:
-                jpeg = _picture(image, guesses.values(), truth)
-                write_atomically(
-                    pictures / f"{street.name.replace('/', '-')}.jpg", partial(Path.write_bytes, data=jpeg)
-                )
-            if street.typical is not None:
-                guesses[_BASELINE] = street.typical
-            for name, guess in guesses.items():
-                error = depth_errors(guess, truth, CAP_M, street.crop)
-                if error is not None:
-                    errors[name][place].append(error)
-            done += 1
-        if not all(errors[name][place] for name in networks):
-            raise DataError(f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with")
+    errors: dict[str, list[list[DepthErrors]]] = {name: [] for name in (*networks, _BASELINE)}
+    for street in streets:
+        progress("depth", done, total)
+        found = _street_errors(street, networks, pictures)
+        for name, compared in errors.items():
+            compared.append(found[name])
+        done += len(street.frames)
     first = next(iter(networks))
     rows = []
     for name, compared in errors.items():
@@ -113,6 +100,28 @@ def depth_protocol(
             row = _depth_row(name, [errors[name][place]], None if name == first else [errors[first][place]])
             rows.append(row | {"leak": leaks[name][place], "street": street.name})
     return rows
+
+
+def _street_errors(
+    street: Street, networks: Mapping[str, PoseDepthNetworks], pictures: Path | None
+) -> dict[str, list[DepthErrors]]:
+    """Errors of the frames of a street by networks, and of its typical depth map where it has one."""
+    errors: dict[str, list[DepthErrors]] = {name: [] for name in (*networks, _BASELINE)}
+    for number, load in enumerate(street.frames):
+        image, truth = load()
+        guesses = {name: each.depth(image) for name, each in networks.items()}
+        if pictures is not None and number == 0:
+            file, jpeg = f"{street.name.replace('/', '-')}.jpg", _picture(image, guesses.values(), truth)
+            write_atomically(pictures / file, partial(Path.write_bytes, data=jpeg))
+        if street.typical is not None:
+            guesses[_BASELINE] = street.typical
+        for name, guess in guesses.items():
+            error = depth_errors(guess, truth, CAP_M, street.crop)
+            if error is not None:
+                errors[name].append(error)
+    if not all(errors[name] for name in networks):
+        raise DataError(f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with")
+    return errors
 
 
 def _picture(image: NDArray[np.uint8], guesses: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:

@@ -66,7 +66,7 @@ def depth_protocol(
         roots: with true depth.
         allow_leak: evaluate also streets that networks were trained on.
         progress: told of the stage, what is done, and of how many.
-        pictures: a folder that receives a picture of the first frame of each street: image, depths, and truth.
+        pictures: a folder that receives a picture of a frame of each street: image, median-scaled depths, and truth.
 
     Returns:
         A row for each networks, and, where depth is dense, one for the median depth map of a root, a baseline that
@@ -82,13 +82,37 @@ def depth_protocol(
         name: [refuse_leak(each, street.seen, allow_leak) for street in streets] for name, each in networks.items()
     }
     total, done = sum(len(street.frames) for street in streets), 0
-    errors: dict[str, list[list[DepthErrors]]] = {name: [] for name in (*networks, _BASELINE)}
-    for street in streets:
-        progress("depth", done, total)
-        found = _street_errors(street, networks, pictures)
-        for name, compared in errors.items():
-            compared.append(found[name])
-        done += len(street.frames)
+    errors: dict[str, list[list[DepthErrors]]] = {name: [[] for _ in streets] for name in (*networks, _BASELINE)}
+    for place, street in enumerate(streets):
+        to_draw = pictures
+        for load in street.frames:
+            progress("depth", done, total)
+            image, truth = load()
+            guesses = {name: each.depth(image) for name, each in networks.items()}
+            if street.typical is not None:
+                guesses[_BASELINE] = street.typical
+            found = {name: depth_errors(guess, truth, CAP_M, street.crop) for name, guess in guesses.items()}
+            compared = {name: error for name, error in found.items() if error is not None}
+            for name, error in compared.items():
+                errors[name][place].append(error)
+            if to_draw is not None and compared:
+                scaled = [guesses[name] * np.float32(compared[name].scale) for name in networks]
+                jpeg, file = _picture(image, scaled, truth), f"{street.name.replace('/', '-')}.jpg"
+                write_atomically(to_draw / file, partial(Path.write_bytes, data=jpeg))
+                to_draw = None
+            done += 1
+        if not all(errors[name][place] for name in networks):
+            raise DataError(f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with")
+    return _depth_rows(networks, streets, errors, leaks)
+
+
+def _depth_rows(
+    networks: Mapping[str, PoseDepthNetworks],
+    streets: Sequence[Street],
+    errors: Mapping[str, list[list[DepthErrors]]],
+    leaks: Mapping[str, list[bool]],
+) -> list[dict[str, Any]]:
+    """Means of each method over streets, and, where there are several, a row for each street."""
     first = next(iter(networks))
     rows = []
     for name, compared in errors.items():
@@ -102,33 +126,10 @@ def depth_protocol(
     return rows
 
 
-def _street_errors(
-    street: Street, networks: Mapping[str, PoseDepthNetworks], pictures: Path | None
-) -> dict[str, list[DepthErrors]]:
-    """Errors of the frames of a street by networks, and of its typical depth map where it has one."""
-    errors: dict[str, list[DepthErrors]] = {name: [] for name in (*networks, _BASELINE)}
-    for number, load in enumerate(street.frames):
-        image, truth = load()
-        guesses = {name: each.depth(image) for name, each in networks.items()}
-        if pictures is not None and number == 0:
-            file, jpeg = f"{street.name.replace('/', '-')}.jpg", _picture(image, guesses.values(), truth)
-            write_atomically(pictures / file, partial(Path.write_bytes, data=jpeg))
-        if street.typical is not None:
-            guesses[_BASELINE] = street.typical
-        for name, guess in guesses.items():
-            error = depth_errors(guess, truth, CAP_M, street.crop)
-            if error is not None:
-                errors[name].append(error)
-    if not all(errors[name] for name in networks):
-        raise DataError(f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with")
-    return errors
-
-
-def _picture(image: NDArray[np.uint8], guesses: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:
-    """A JPEG, image, median-scaled depths and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
+def _picture(image: NDArray[np.uint8], depths: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:
+    """A JPEG, image, depths in metres and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
     known = truth > 0
-    scaled = [guess * np.float32(np.median(truth[known]) / np.median(guess[known])) for guess in guesses]
-    nearness = [1 / depth for depth in scaled] + [np.where(known, 1 / np.where(known, truth, 1), 0)]
+    nearness = [1 / depth for depth in depths] + [np.where(known, 1 / np.where(known, truth, 1), 0)]
     height, width = (round(n * min(1, _PICTURE_WIDTH / image.shape[1])) for n in image.shape[:2])
     points = 1 + 2 * round(image.shape[1] / _PICTURE_WIDTH)  # of LiDAR, which would vanish in a smaller picture
     nearness[-1] = cv2.dilate(nearness[-1], np.ones((points, points)))

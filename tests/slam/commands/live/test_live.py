@@ -137,9 +137,12 @@ def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wante
 ) -> None:
     messages: list[dict[str, Any]] = []
     request = request_of(street / "images", tiny_weights, SETTINGS, tmp_path / "live", wait=0.5)
-    with pytest.raises(SlamError, match=r"images were dropped, .* \(--every-frame drops none\)"):
-        run_live(request, messages.append)  # while the first one is measured, all others come
-    assert "images dropped, " in caplog.text
+    try:  # while the first one is measured, most others come: how many frames are left depends on the machine
+        run_live(request, messages.append)
+        assert messages[-1]["dropped"] > 0 and len(messages[-1]["stamps"]) + messages[-1]["dropped"] == FRAMES
+    except SlamError as error:
+        assert re.search(r"images were dropped, .* \(--every-frame drops none\)", str(error))
+    assert re.search("images (were )?dropped", caplog.text)
     folder = run_live(request.model_copy(update={"every_frame": True}), messages.append)
     assert messages[-1]["dropped"] == 0 and folder.metrics().tree()["sequence"]["frames"] == FRAMES
 

@@ -6,11 +6,14 @@ with missing frame numbers is split there, so that no snippet spans a gap in tim
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
-from erfsfm.common.readers.images import first_size, image_folder, list_images, recording_name
+from erfsfm.common.readers.images import first_size, has_images, image_folder, list_images, recording_name
 from erfsfm.common.readers.kitti import (
     CAM_TO_CAM,
     ODOMETRY_CALIBRATION,
@@ -22,23 +25,19 @@ from erfsfm.common.readers.kitti import (
     find_drives,
     find_odometry_root,
 )
-from erfsfm.common.readers.numbering import by_name, by_number
+from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_number
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos, video_name
 from erfsfm.data.prepared import INDEX_FILE, read_prepared
-from erfsfm.data.recordings import Recording, split_at_gaps
-from erfsfm.data.video import Video
+from erfsfm.data.recordings import Recording, Video, split_at_gaps
 from erfsfm.geometry.camera import Camera
 
 INDOOR_HEIGHT_M = 0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
 _COLOUR = (2, 3)
+Number = TypeVar("Number", int, str)
 
 
 def discover(root: Path) -> list[Recording]:
-    """All recordings under a root, two folders deep, sorted by name.
-
-    Raises:
-        DataError: no recording found.
-    """
+    """All recordings under a root, two folders deep, sorted by name; ``DataError`` where there is none."""
     if not root.exists():
         raise DataError(f"no data set at {root}: the path does not exist")
     found = _recordings_at(root)
@@ -70,17 +69,14 @@ def _recordings_at(root: Path) -> list[Recording]:
 
 
 def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
-    """The colour cameras of a sequence, else its grey ones, in parts without gaps."""
-    present = [camera for camera in ODOMETRY_CAMERAS if (sequence / f"image_{camera}").is_dir()]
+    """The cameras of a sequence in parts without gaps."""
+    folders = {camera: sequence / f"image_{camera}" for camera in ODOMETRY_CAMERAS}
+    empty = next((folder for folder in folders.values() if folder.is_dir() and not has_images(folder)), None)
+    if empty is not None:
+        raise DataError(f"{empty} holds no png or jpg; download or extract the images")
     poses = root.base / "poses" / f"{sequence.name}.txt"
     recordings = []
-    for camera in [camera for camera in present if camera in _COLOUR] or present[:1]:
-        folder = sequence / f"image_{camera}"
-        images = list_images(folder)
-        if not images:
-            raise DataError(f"{folder} holds no png or jpg; download or extract the images")
-        files = by_number(images)
-        height, width = first_size(files.paths)
+    for camera, files, (height, width) in _cameras(folders):
         calibration, row = CalibrationFile(sequence / ODOMETRY_CALIBRATION), f"P{camera}"
         pinhole = calibration.pinhole(row, width, height)
         tx, ty, tz = (float(value) for value in calibration.T_camera_cam0(row)[:3, 3])
@@ -106,19 +102,11 @@ def _simulated_height(root: OdometryRoot) -> float | None:
 
 
 def open_drive(drive: Path) -> list[Recording]:
-    """Its colour cameras, else the first of its grey ones, in parts without gaps; none where it has no images.
-
-    Raises:
-        DataError: calibration is missing, or the images are of another shape than the camera.
-    """
+    """The cameras of a raw drive in parts without gaps; none where it has no images."""
     drive = drive.absolute()
-    images = {camera: list_images(drive / f"image_{camera}" / "data") for camera in RAW_CAMERAS}
-    present = [camera for camera in RAW_CAMERAS if images[camera]]
     oxts = drive / "oxts" / "data"
     recordings = []
-    for camera in [camera for camera in present if int(camera) in _COLOUR] or present[:1]:
-        files = by_number(images[camera])
-        height, width = first_size(files.paths)
+    for camera, files, (height, width) in _cameras({c: drive / f"image_{c}" / "data" for c in RAW_CAMERAS}):
         calibration = CalibrationFile(drive.parent / CAM_TO_CAM)
         whole = Recording(
             f"kitti_raw/{drive_name(drive.name)}",
@@ -128,6 +116,15 @@ def open_drive(drive: Path) -> list[Recording]:
         )
         recordings += split_at_gaps(whole, files)
     return recordings
+
+
+def _cameras(folders: dict[Number, Path]) -> Iterator[tuple[Number, NumberedFiles, tuple[int, int]]]:
+    """Images of the colour cameras, else of the first of the grey ones, with their height and width."""
+    images = {camera: list_images(folder) for camera, folder in folders.items()}
+    present = [camera for camera in folders if images[camera]]
+    for camera in [camera for camera in present if int(camera) in _COLOUR] or present[:1]:
+        files = by_number(images[camera])
+        yield camera, files, first_size(files.paths)
 
 
 def _depth(sequence: Path, images: tuple[Path, ...]) -> tuple[Path, ...] | None:
@@ -142,22 +139,20 @@ def _own(root: Path) -> list[Recording]:
     home = root.parent if is_video else root
     if not (home / CAMERA_FILE).is_file():
         return []
-    camera = _camera(home / CAMERA_FILE)
+    written = read_camera_file(home / CAMERA_FILE)
+    if written.is_distorted:
+        raise DataError(f"{home / CAMERA_FILE} describes a distorted camera: undistort the images before training")
+    camera = Camera.of(written.pinhole)
     images = [] if is_video else _images(home)
-    if images:
-        files = by_name(images)
-        depth = tuple(home / "depth" / f"{path.stem}.png" for path in files.paths)
-        exact = all(path.is_file() for path in depth)  # as a depth camera measures it
-        height_m = read_camera_file(home / CAMERA_FILE).height_or(None) or INDOOR_HEIGHT_M
-        name = f"folder/{recording_name(home)}"
-        return split_at_gaps(
-            Recording(
-                name, files.paths, camera, depth=depth if exact else None, camera_height_m=height_m if exact else None
-            ),
-            files,
-        )
-    videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
-    return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
+    if not images:
+        videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
+        return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
+    files = by_name(images)
+    whole = Recording(f"folder/{recording_name(home)}", files.paths, camera)
+    depth = tuple(home / "depth" / f"{path.stem}.png" for path in files.paths)
+    if all(path.is_file() for path in depth):  # as a depth camera measures it
+        whole = replace(whole, depth=depth, camera_height_m=written.height_or(None) or INDOOR_HEIGHT_M)
+    return split_at_gaps(whole, files)
 
 
 def _images(home: Path) -> list[Path]:
@@ -165,10 +160,3 @@ def _images(home: Path) -> list[Path]:
     usual = image_folder(home)
     folders = [usual] if usual is not None else sorted(path for path in home.iterdir() if path.is_dir())
     return next((images for folder in folders if (images := list_images(folder))), [])
-
-
-def _camera(path: Path) -> Camera:
-    camera = read_camera_file(path)
-    if camera.is_distorted:
-        raise DataError(f"{path} describes a distorted camera: undistort the images before training")
-    return Camera.of(camera.pinhole)

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.array_cache import ArrayCache, ImageCache
+from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
-from erfsfm.data.samples import single_image
-from erfsfm.labels.structure import TeacherStructure, snippet_motion
+from erfsfm.data.window import TeacherStructure, snippet_motion
 
 FARTHEST_M = 200.0  # what the simulator leaves unknown is sky; of a depth camera it may be anywhere
 
@@ -50,41 +49,13 @@ class ExactLabels:
         return TeacherStructure(T_source_target, *self.bounds(recording, first + sources // 2))
 
 
-class ExactImages:
-    """Images drawn from recordings with exact depth, each recording by its chance."""
-
-    def __init__(
-        self,
-        recordings: Sequence[Recording],
-        chances: NDArray[np.float64],
-        config: ExperimentConfig,
-        cache: ImageCache,
-        labels: ExactLabels,
-    ) -> None:
-        self._recordings, self._chances, self._config = recordings, chances, config
-        self._cache, self._labels = cache, labels
-
-    def draw(self, rng: np.random.Generator) -> dict[str, Tensor]:
-        """A `single_image` of a random frame."""
-        recording = self._recordings[int(rng.choice(len(self._recordings), p=self._chances))]
-        index = int(rng.integers(len(recording)))
-        network = self._config.network
-        camera = recording.camera.resized(network.width, network.height, network.fidelity)
-        bounds = self._labels.bounds(recording, index)
-        return single_image(self._cache.image(recording, index), camera, bounds, self._config, rng)
-
-
 def depth_mb(config: ExperimentConfig) -> int:
     """The part of ``data.cache_mb`` for exact depth."""
     return config.data.cache_mb // 5 if config.data.exact > 0 or config.teacher.exact else 0
 
 
 def by_label(recordings: Sequence[Recording], config: ExperimentConfig) -> tuple[list[Recording], list[Recording]]:
-    """The recordings of which single images with exact depth are drawn, and those of which snippets are.
-
-    Raises:
-        DataError: one kind is wanted and absent.
-    """
+    """The recordings of which single images with exact depth are drawn, and those of which snippets are."""
     exact = [recording for recording in recordings if recording.exact]
     measured = [recording for recording in recordings if not recording.exact]
     if config.teacher.exact and measured:

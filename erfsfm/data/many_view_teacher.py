@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, as_completed
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import as_completed
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import BinaryIO, Literal
 
 import cv2
 import numpy as np
@@ -27,10 +27,10 @@ from erfsfm.common.readers.video import VideoFrames
 from erfsfm.common.threads import limit_library_threads
 from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
+from erfsfm.data.window import TeacherStructure, snippet_motion
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
 from erfsfm.labels.many_views import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
-from erfsfm.labels.structure import TeacherStructure, snippet_motion
 from erfsfm.mvs.flow import Grey, measure
 from erfsfm.mvs.views import neighbours_around
 
@@ -89,16 +89,8 @@ class DriveLabels:
         name = f"{self.skipped + target:06d}{'.webp' if self.compact else '.npz'}"
         return self.folder / f"{self.size[1]}x{self.size[0]}" / name
 
-    def motion(self, first: int, sources: int) -> NDArray[np.float32]:
-        """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at a frame, in camera heights."""
-        return snippet_motion(self.T_world_camera, first, sources).astype(np.float32)
-
     def label(self, target: int) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
-        """Least and most inverse depth ``(H, W)`` of a frame.
-
-        Raises:
-            TrainingError: the file is missing or damaged.
-        """
+        """Least and most inverse depth ``(H, W)`` of a frame; ``TrainingError`` where the file is damaged."""
         path = self.label_file(target)
         try:
             if self.compact:
@@ -128,11 +120,7 @@ class DriveLabels:
         self.keep_poses(T_world_camera)
 
     def require_weights(self, weights: str) -> None:
-        """Refuse poses by other weights.
-
-        Raises:
-            TrainingError: the poses that are kept are of others.
-        """
+        """Refuse poses by other weights."""
         both = self.poses_file.is_file() and self.weights_file.is_file()
         known = self.weights_file.read_text() if both else weights
         if known != weights:
@@ -143,7 +131,7 @@ class DriveLabels:
 
     def keep_poses(self, T_world_camera: NDArray[np.float64]) -> None:
         """Write the poses ``(N, 4, 4)`` of all frames."""
-        write_atomically(self.poses_file, lambda path: _save(path, T_world_camera))
+        _write(self.poses_file, lambda file: np.save(file, T_world_camera))
 
     def measure_labels(self, targets: Sequence[int], learned: Learned | None = None) -> int:
         """Measure and keep the labels of some frames; returns their number.
@@ -160,15 +148,16 @@ class DriveLabels:
                 cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
                 for values in bounds
             )
-            write_atomically(self.label_file(target), lambda p: _compress(p, least=least, most=most), sync=False)  # noqa: B023
+            arrays = {"least": least, "most": most}
+            _write(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
         return len(targets)
 
     def _by_flow(self, target: int) -> Bounds | None:
         """Label of a frame at a size at which flow is fine."""
-        ratio = min(LARGEST_WIDTH / self.recording.camera.width, 1)
         camera = self.recording.camera
+        ratio = min(LARGEST_WIDTH / camera.width, 1)
         camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
-        image, around = self._image(target, camera), self._greys(self._around(target), camera)
+        image, around = self._image(target, camera), self._around(target, camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
         return label(_grey(image), [*around.values()], camera.K.astype(np.float64), self._motion(target, around))
@@ -177,7 +166,7 @@ class DriveLabels:
         """Label of a frame at the labels' size, around its learned depth, which is refined in finer images."""
         finer = FINER if self.recording.camera.width > 1.5 * self.size[1] else 1
         camera = self.recording.camera.resized(finer * self.size[1], finer * self.size[0])
-        image, around = self._image(target, camera), self._greys(self._around(target), camera)
+        image, around = self._image(target, camera), self._around(target, camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
         grey, K = _grey(image), camera.K.astype(np.float64)
@@ -193,9 +182,9 @@ class DriveLabels:
             return None
         return shrunk(*refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth), finer)
 
-    def _around(self, target: int) -> list[int]:
+    def _around(self, target: int, camera: Camera) -> dict[int, Grey]:
         """Frames before and after."""
-        return [target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording)]
+        return self._greys([target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording)], camera)
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
@@ -211,12 +200,6 @@ class DriveLabels:
             return self.recording.image(index, camera.height, camera.width)
         except DataError:
             return None
-
-
-def motion_alone(T_source_target: NDArray[np.float32], size: tuple[int, int]) -> TeacherStructure:
-    """A structure that bounds no depth; ``size`` is height and width of the images."""
-    nothing = np.zeros(size, dtype=np.float16)
-    return TeacherStructure(T_source_target, nothing, np.full_like(nothing, np.inf))
 
 
 class ManyViewTeacher:
@@ -250,94 +233,82 @@ class ManyViewTeacher:
 
     def drive(self, recording: Recording) -> DriveLabels:
         """Where the labels of a recording are kept."""
-        known = self._drives.get(recording.key)
-        if known is None:
+        if recording.key not in self._drives:
             if recording.labels is not None:
-                known = DriveLabels(recording, recording.labels, self._size, self._stride, True, recording.skipped)
+                drive = DriveLabels(recording, recording.labels, self._size, self._stride, True, recording.skipped)
             else:
-                known = DriveLabels(recording, self._folder / self._digest(recording), self._size, self._stride)
-            self._drives[recording.key] = known
-        return known
+                drive = DriveLabels(recording, self._folder / _digest(recording), self._size, self._stride)
+            self._drives[recording.key] = drive
+        return self._drives[recording.key]
 
     def structure(self, recording: Recording, first: int, sources: int) -> TeacherStructure:
         """Of the snippet that begins at a frame."""
         drive, target = self.drive(recording), first + sources // 2
+        motion = snippet_motion(drive.T_world_camera, first, sources).astype(np.float32)
         if self.measures == "poses":
-            return motion_alone(drive.motion(first, sources), self._size)
+            return TeacherStructure(motion, np.zeros(self._size, np.float16), np.full(self._size, np.inf, np.float16))
         least, most = self._labels.get((*recording.key, target), lambda: np.stack(drive.label(target)))
-        return TeacherStructure(drive.motion(first, sources), least, most)
+        return TeacherStructure(motion, least, most)
 
     def prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
         """Compute what is not there yet, in as many processes as there are cores; a few labels in this one.
 
         Of several programs with one folder (the processes of a training on several devices) one computes and the
-        others wait for it.
-
-        Raises:
-            TrainingError: a drive has no trajectory or no scale, poses by other weights, or too few labels in a
-                prepared folder.
+        others wait for it. ``TrainingError``: a drive has no trajectory or no scale, poses by other weights, or too few
+        labels in a prepared folder.
         """
         with FolderLock() as lock:
             lock.wait_for(self._folder)
-            self._prepare(recordings, sources, weights, progress)
-
-    def _prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
-        drives = [self.drive(recording) for recording in recordings]
-        for drive in drives:
-            drive.require_weights(weights)
-        without = [drive for drive in drives if not drive.poses_file.is_file()]
-        for drive in drives:
-            if drive.compact and (drive in without or (self.measures != "poses" and any(_missing(drive, sources)))):
-                raise TrainingError(f"{drive.folder} lacks labels: prepare the data again with this teacher and size")
-        for done, drive in enumerate(without):
-            progress("teacher: poses", done, len(without))
-            drive.measure_poses(weights)
-        if self.measures == "poses":
-            return
-        tasks = [(drive, chunk) for drive in drives for chunk in _missing(drive, sources)]
-        total, done = sum(len(chunk) for _, chunk in tasks), 0
-        if not tasks:
-            return
-        if len(tasks) == 1 and self._learned is None:  # a process would take longer to start
-            ((drive, chunk),) = tasks
-            with limit_library_threads():
-                progress("teacher: depth", drive.measure_labels(chunk), total)
-            return
-        with processes("measures labels") as pool:
-            running: list[Future[int]] = [
-                pool.submit(drive.measure_labels, chunk, self._learned) for drive, chunk in tasks
-            ]
-            for future in as_completed(running):
-                done += future.result()
-                progress("teacher: depth", done, total)
-
-    def _digest(self, recording: Recording) -> str:
-        """Of the camera, the names, sizes and times of the images, and the version of this file."""
-        stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
-        seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
-        seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
-        return hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
+            drives = [self.drive(recording) for recording in recordings]
+            for drive in drives:
+                drive.require_weights(weights)
+            without = [drive for drive in drives if not drive.poses_file.is_file()]
+            tasks = [] if self.measures == "poses" else [each for drive in drives for each in _missing(drive, sources)]
+            for drive in (*without, *(drive for drive, _ in tasks)):
+                if drive.compact:
+                    raise TrainingError(
+                        f"{drive.folder} lacks labels: prepare the data again with this teacher and size"
+                    )
+            for done, drive in enumerate(without):
+                progress("teacher: poses", done, len(without))
+                drive.measure_poses(weights)
+            total, done = sum(len(chunk) for _, chunk in tasks), 0
+            if len(tasks) == 1 and self._learned is None:  # a process would take longer to start
+                ((drive, chunk),) = tasks
+                with limit_library_threads():
+                    progress("teacher: depth", drive.measure_labels(chunk), total)
+            elif tasks:
+                with processes("measures labels") as pool:
+                    running = [pool.submit(drive.measure_labels, chunk, self._learned) for drive, chunk in tasks]
+                    for future in as_completed(running):
+                        done += future.result()
+                        progress("teacher: depth", done, total)
 
 
-def _missing(drive: DriveLabels, sources: int) -> Iterator[list[int]]:
+def _digest(recording: Recording) -> str:
+    """Of the camera, the names, sizes and times of the images, and the version of this file."""
+    stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
+    seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
+    seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
+    return hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
+
+
+def _missing(drive: DriveLabels, sources: int) -> list[tuple[DriveLabels, list[int]]]:
     """Frames without a label yet, in portions."""
     frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
-    for first in range(0, len(frames), _CHUNK):
-        yield frames[first : first + _CHUNK]
+    return [(drive, frames[first : first + _CHUNK]) for first in range(0, len(frames), _CHUNK)]
 
 
 def _grey(image: NDArray[np.uint8]) -> Grey:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _save(path: Path, array: NDArray[Any]) -> None:
-    with path.open("wb") as file:
-        np.save(file, array)
+def _write(path: Path, save: Callable[[BinaryIO], None], sync: bool = True) -> None:
+    def fill(part: Path) -> None:
+        with part.open("wb") as file:  # given a path, NumPy would add a suffix
+            save(file)
 
-
-def _compress(path: Path, **arrays: NDArray[Any]) -> None:
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    write_atomically(path, fill, sync)
 
 
 SMALLEST = 0.002  # inverse depth of code 0, one over camera heights: 800 m; code 255 is 0.7 m
@@ -370,11 +341,7 @@ def encode(least: NDArray[np.floating], most: NDArray[np.floating]) -> bytes:
 
 
 def decode(data: bytes) -> tuple[Bound, Bound]:
-    """Least and most inverse depth ``(H, W)``.
-
-    Raises:
-        ValueError: these bytes are no label.
-    """
+    """Least and most inverse depth ``(H, W)``; ``ValueError`` where these bytes are no label."""
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if picture is None:
         raise ValueError("it is no picture")

@@ -12,8 +12,8 @@ import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -31,19 +31,9 @@ from erfsfm.geometry.camera import Camera
 logger = logging.getLogger(__name__)
 
 INDEX_FILE = "prepared.yaml"
+_POSES, _LABELS = "poses.txt", "labels"  # of a recording: true poses of its camera (KITTI), and the teacher's
 QUALITY = 90  # of the JPEG images: 16 kB each at 416x128
 _MOST_FRAMES = 10**6  # of one recording: a day at ten frames a second
-
-
-class _Camera(Section):
-    """Size and intrinsics of the images, pixels."""
-
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
 
 
 class _Entry(Section):
@@ -52,7 +42,7 @@ class _Entry(Section):
     name: str = Field(min_length=1, description="as in the leak record, without frames")
     start: int = Field(ge=0, description="number of the first frame")
     frames: int = Field(gt=0, le=_MOST_FRAMES)
-    camera: _Camera
+    camera: Camera = Field(description="size and intrinsics of the images, pixels")
     camera_height_m: float | None = Field(default=None, gt=0, description="of a simulated world")
 
 
@@ -62,43 +52,20 @@ class _Index(Section):
     recordings: list[_Entry]
 
 
-@dataclass(frozen=True)
-class _Place:
-    """The files of one recording."""
-
-    folder: Path
-
-    def image(self, frame: int) -> Path:
-        return self.folder / "images" / f"{frame:06d}.jpg"
-
-    def depth(self, frame: int) -> Path:
-        """True depth, 1/256 m."""
-        return self.folder / "depth" / f"{frame:06d}.png"
-
-    @property
-    def poses(self) -> Path:
-        """True poses of this camera, in KITTI's format."""
-        return self.folder / "poses.txt"
-
-    @property
-    def labels(self) -> Path:
-        """What the many-view teacher measured."""
-        return self.folder / "labels"
+def _file(folder: Path, kind: Literal["images", "depth"], frame: int) -> Path:
+    """An image, or true depth in 1/256 m, of a recording's folder."""
+    return folder / kind / f"{frame:06d}{'.jpg' if kind == 'images' else '.png'}"
 
 
 def read_prepared(root: Path) -> list[Recording]:
-    """The recordings of a prepared folder.
-
-    Raises:
-        DataError: the index is damaged.
-    """
+    """The recordings of a prepared folder; ``DataError`` where its index is damaged."""
     try:
         index = _Index.model_validate(read_yaml(root / INDEX_FILE))
     except YamlError as error:
         raise DataError(str(error)) from error
     except ValidationError as error:
         raise DataError(f"{root / INDEX_FILE} is damaged: {first_problem(error)}; prepare again") from error
-    return [_recording(_place(root, number), entry) for number, entry in enumerate(index.recordings)]
+    return [_recording(root / f"{number:04d}", entry) for number, entry in enumerate(index.recordings)]
 
 
 def write_prepared(
@@ -118,9 +85,6 @@ def write_prepared(
         teacher: whose measurements are kept, of the recordings without exact depth.
         network: whose size the frames get.
         progress: told of the stage, what is done, and of how many.
-
-    Raises:
-        DataError: no image can be read.
     """
     length, middle = network.sources + 1, network.sources // 2
     snippets = [snippet.recording.part(snippet.first, snippet.first + length) for snippet in held_out]
@@ -130,16 +94,17 @@ def write_prepared(
         unreadable: list[str] = []
         for number, recording in enumerate(recordings):
             progress("frames", number, len(recordings))
-            place = _place(unfinished, number)
-            unreadable += _write_images(place, recording, network)
+            folder = unfinished / f"{number:04d}"
+            unreadable += _write_images(folder, recording, network)
             if number >= len(training):
-                _write_truth(place, recording, middle)
+                _write_truth(folder, recording, middle)
             elif recording.exact:
                 for index in range(len(recording)):
                     depth = np.rint(recording.shrunk_depth(index, network.height, network.width) * 256)
-                    _put(place.depth(recording.start + index), bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]))
+                    path = _file(folder, "depth", recording.start + index)
+                    _put(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]))
             elif teacher is not None:
-                _write_labels(teacher.drive(recording), place, network)
+                _write_labels(teacher.drive(recording), folder / _LABELS, network)
         total = sum(map(len, recordings))
         if len(unreadable) == total:
             raise DataError(f"none of {total} images can be read: {unreadable[0]}")
@@ -152,39 +117,35 @@ def write_prepared(
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _place(root: Path, number: int) -> _Place:
-    return _Place(root / f"{number:04d}")
-
-
-def _recording(place: _Place, entry: _Entry) -> Recording:
+def _recording(folder: Path, entry: _Entry) -> Recording:
     numbers = range(entry.start, entry.start + entry.frames)
-    depth = tuple(place.depth(n) if place.depth(n).is_file() else None for n in numbers)
+    depth = tuple(path if (path := _file(folder, "depth", n)).is_file() else None for n in numbers)
+    poses = folder / _POSES
     return Recording(
         entry.name,
-        tuple(place.image(n) for n in numbers),
-        Camera(**entry.camera.model_dump()),
+        tuple(_file(folder, "images", n) for n in numbers),
+        entry.camera,
         depth=depth if any(depth) else None,
-        poses_file=place.poses if place.poses.is_file() else None,
+        poses_file=poses if poses.is_file() else None,
         camera_height_m=entry.camera_height_m,
         start=entry.start,
         stored=entry.frames,
         without_stops=True,
-        labels=place.labels,
+        labels=folder / _LABELS,
     )
 
 
 def _entry(recording: Recording, network: NetworkConfig) -> _Entry:
-    camera = recording.camera.resized(network.width, network.height, network.fidelity)
     return _Entry(
         name=recording.name,
         start=recording.start,
         frames=len(recording),
-        camera=_Camera(**vars(camera)),
+        camera=recording.camera.resized(network.width, network.height, network.fidelity),
         camera_height_m=recording.camera_height_m,
     )
 
 
-def _write_images(place: _Place, recording: Recording, network: NetworkConfig) -> list[str]:
+def _write_images(folder: Path, recording: Recording, network: NetworkConfig) -> list[str]:
     """Write the frames; returns what is wrong with those that cannot be read."""
 
     def shrink(index: int) -> str:
@@ -193,7 +154,7 @@ def _write_images(place: _Place, recording: Recording, network: NetworkConfig) -
         except DataError as error:
             return str(error)
         jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-        _put(place.image(recording.start + index), bytes(jpeg))
+        _put(_file(folder, "images", recording.start + index), bytes(jpeg))
         return ""
 
     one_by_one = recording.video is not None  # a video is decoded in order
@@ -201,19 +162,19 @@ def _write_images(place: _Place, recording: Recording, network: NetworkConfig) -
         return [problem for problem in pool.map(shrink, range(len(recording))) if problem]
 
 
-def _write_truth(place: _Place, snippet: Recording, middle: int) -> None:
+def _write_truth(folder: Path, snippet: Recording, middle: int) -> None:
     """Write what is known of a snippet to validate on: depth of its middle frame, as it is stored, and poses."""
     depth = snippet.depth[middle] if snippet.depth else None
     if depth is not None:
-        _put(place.depth(snippet.start + middle), depth.read_bytes())
+        _put(_file(folder, "depth", snippet.start + middle), depth.read_bytes())
     T_world_camera = snippet.true_poses()
     if T_world_camera is not None:
-        np.savetxt(place.poses, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
+        np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
 
 
-def _write_labels(measured: DriveLabels, place: _Place, network: NetworkConfig) -> None:
+def _write_labels(measured: DriveLabels, folder: Path, network: NetworkConfig) -> None:
     """Write the poses and labels that are there, labels in their compact form."""
-    kept = DriveLabels(measured.recording, place.labels, measured.size, measured.stride, compact=True)
+    kept = DriveLabels(measured.recording, folder, measured.size, measured.stride, compact=True)
     kept.keep_poses(measured.T_world_camera)
     if measured.weights_file.is_file():
         shutil.copyfile(measured.weights_file, kept.weights_file)

@@ -6,6 +6,8 @@ Images are decoded on demand.
 from __future__ import annotations
 
 import logging
+import sys
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,13 +16,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import read_image, read_values, resize_image
+from erfsfm.common.readers.images import Image, read_image, read_values, resize_image
 from erfsfm.common.readers.numbering import NumberedFiles
+from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import Fidelity
-from erfsfm.data.video import Video
 from erfsfm.geometry.camera import Camera
 
 logger = logging.getLogger(__name__)
+
+_kept: dict[Path, Image] = {}  # of this process: the frames ``(N, height, width, 3)`` of each video at one size
+
+
+class Video:
+    """A video file with random access to downscaled frames.
+
+    Training reads frames in any order, and a seek in compressed video is slow. Hence the first access decodes the file
+    from its beginning to its end, and all frames are kept, downscaled, in a temporary file that the system pages in and
+    out: 160 kB a frame at 416x128. Each process has its own, which a video that is sent to it does not carry.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Count the frames, which takes one pass: what the file announces may be wrong."""
+        self.path = path
+        frames = VideoFrames(path, counted_frames=sys.maxsize)
+        self._length = len(frames)
+        self.height, self.width = frames.height, frames.width
+        _kept.pop(path, None)  # of a file that lay there before
+
+    def __len__(self) -> int:
+        return self._length
+
+    def image(self, index: int, height: int, width: int) -> Image:
+        """One frame ``(height, width, 3)`` uint8 RGB, resized without crop."""
+        frames = _kept.get(self.path)
+        if frames is None or frames.shape[1:3] != (height, width):
+            frames = _kept[self.path] = self._keep(height, width)
+        return np.array(frames[index])
+
+    def _keep(self, height: int, width: int) -> Image:
+        frames = VideoFrames(self.path, counted_frames=0)
+        with tempfile.TemporaryFile(prefix="erfsfm-video-") as file:
+            for index in range(self._length):
+                file.write(resize_image(frames.read(index), height, width).tobytes())
+            file.flush()
+            return np.memmap(file, np.uint8, "r", shape=(self._length, height, width, 3))
 
 
 @dataclass(frozen=True)
@@ -82,11 +121,7 @@ class Recording:
         return self.part(begin, end) if begin < end else None
 
     def image(self, index: int, height: int, width: int) -> NDArray[np.uint8]:
-        """Frame as ``(height, width, 3)`` uint8 RGB, resized without crop.
-
-        Raises:
-            DataError: the file is missing, incomplete, no image, or of another size than the camera.
-        """
+        """Frame as ``(height, width, 3)`` uint8 RGB, resized without crop; ``DataError`` where it cannot be read."""
         stored = self.images[index]
         if self.video is not None:
             self._require_size(stored, self.video.height, self.video.width)
@@ -114,11 +149,7 @@ class Recording:
     def true_poses(self, fidelity: Fidelity = "default") -> NDArray[np.float64] | None:
         """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.
 
-        Args:
-            fidelity: ``paper`` gives the poses of camera 0, as the reference compares with.
-
-        Raises:
-            DataError: the file is malformed, or has fewer rows than there are frames.
+        In ``paper`` fidelity those of camera 0, as the reference compares with.
         """
         if self.poses_file is None:
             return None

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.augmentation import Maps, augment, rolled, weathered
+from erfsfm.data.window import HEIGHTS, TeacherStructure
 from erfsfm.geometry.camera import Camera
-from erfsfm.labels.structure import HEIGHTS, TeacherStructure
 
 # An image does not show its focal length. Under a teacher lengths are those of a camera of this
 # focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).

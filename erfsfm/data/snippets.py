@@ -20,15 +20,14 @@ from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
-from erfsfm.data.exact_depth import ExactImages, ExactLabels, by_label, depth_mb
+from erfsfm.data.exact_depth import ExactLabels, by_label, depth_mb
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, depth_alone, single_image, training_sample
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.standstill import moving_parts
-from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
+from erfsfm.data.window import Snippet, TeacherStructure, first_readable, load_window, readable, snippet_motion
 from erfsfm.geometry.camera import Camera
-from erfsfm.labels.structure import TeacherStructure, snippet_motion
 
 logger = logging.getLogger(__name__)
 
@@ -56,18 +55,18 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._rank = rank
         labels = depth_mb(config) + (0 if many_views is None else labels_mb(config.data))
         self._cache = ImageCache(config.data.cache_mb - labels, config.network.height, config.network.width)
-        self._reader = SnippetReader()
+        self._unreadable: set[str] = set()
         self._exact_labels = ExactLabels((config.network.height, config.network.width), depth_mb(config))
         self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
-        exact, self._measured = by_label(self.recordings, config)
+        self._exact, self._measured = by_label(self.recordings, config)
         weights = config.data.weights
         _require_known(self.recordings, weights)
         windows = [len(recording) - length + 1 for recording in self._measured]
         self._probabilities = chances(self._measured, windows, weights)
-        worlds = chances(exact, [1] * len(exact), weights)  # a long world is as good as a short one
-        self._exact = ExactImages(exact, worlds, config, self._cache, self._exact_labels) if exact else None
+        # a long world is as good as a short one
+        self._exact_probabilities = chances(self._exact, [1] * len(self._exact), weights)
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
@@ -81,19 +80,27 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def draw(self, number: int) -> dict[str, Tensor]:
         """Sample ``number``, a `training_sample` of the first snippet drawn that can be read.
 
-        The first samples of a batch are of `ExactImages` under ``data.exact``.
+        The first samples of a batch are a `single_image` with exact depth each under ``data.exact``.
         """
-        training, network = self._config.training, self._config.network
+        training = self._config.training
         rng = np.random.default_rng([training.seed, number])
-        if self._exact is not None and number % training.batch < training.of_batch(self._config.data.exact):
-            return self._exact.draw(rng)
-        snippet, images = self._reader.first_readable(self._chosen(rng), self._images)
-        camera = snippet.recording.camera.resized(network.width, network.height, network.fidelity)
+        if self._exact and number % training.batch < training.of_batch(self._config.data.exact):
+            recording = self._exact[int(rng.choice(len(self._exact), p=self._exact_probabilities))]
+            index = int(rng.integers(len(recording)))
+            bounds, camera = self._exact_labels.bounds(recording, index), self._camera(recording)
+            return single_image(self._cache.image(recording, index), camera, bounds, self._config, rng)
+        snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
+        camera = self._camera(snippet.recording)
         seen = self._structure(snippet, images, camera)
         if self._config.single_images:
             assert seen is not None, "there are labels"
             return single_image(images[0], camera, (seen.least, seen.most), self._config, rng)
         return training_sample(images, camera, seen, self._config, rng)
+
+    def _camera(self, recording: Recording) -> Camera:
+        """At the networks' size."""
+        network = self._config.network
+        return recording.camera.resized(network.width, network.height, network.fidelity)
 
     def _images(self, snippet: Snippet) -> list[NDArray[np.uint8]]:
         """Those of a sample in time order: the snippet's, or its target alone."""
@@ -173,24 +180,15 @@ def labels_mb(config: DataConfig) -> int:
 
 
 def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
-    """Recordings that hold at least one snippet.
-
-    Raises:
-        DataError: none does.
-    """
+    """Recordings that hold at least one snippet; ``DataError`` where none does."""
     kept = [r for r in recordings if len(r) >= length]
     if not kept:
-        sizes = _some([f"{r.name} ({len(r)} frames)" for r in recordings]) or "no recording"
-        raise DataError(f"a snippet needs {length} consecutive frames; found {sizes}")
+        raise DataError(f"a snippet needs {length} consecutive frames; found {_lengths(recordings) or 'no recording'}")
     return kept
 
 
 def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
-    """Training and validation recordings of all roots, by the configuration's split, ranges and exclusions.
-
-    Raises:
-        DataError: no root, nothing left to train on, or ranges of nothing.
-    """
+    """Training and validation recordings of all roots, by the configuration's split, ranges and exclusions."""
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     split = read_split_file(config.split) if config.split else Split()
@@ -206,8 +204,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     found = [recording for root in config.roots for recording in discover(root)]
     for key, span in zip(config.ranges, ranges):
         if all(span.counted_in(recording.name) is None for recording in found):
-            names = _some([recording.name for recording in found])
-            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {names}")
+            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {_names(found)}")
     _require_begun(found, [*ranges, *listed, *held_out])
     training: list[Recording] = []
     validation: list[Recording] = []
@@ -217,19 +214,18 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
         for part in _chosen(recording, ranges, listed):
             training += _rest(part, forbidden)
     if not training:
-        names = _some([recording.name for recording in found])
         raise DataError(
-            f"nothing left to train on: every recording found ({names}) is excluded or used to validate or test; see "
-            "data.exclude, data.validation, data.split and data.leave_out"
+            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used to validate or "
+            "test; see data.exclude, data.validation, data.split and data.leave_out"
         )
     if config.validation_share > 0:
         training, ends = _ends_split_off(training, config.validation_share)
         validation += ends
     if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
-        names, wanted = _some([recording.name for recording in found]), _some([*config.validation, *split.validation])
+        wanted = _some([*config.validation, *split.validation])
         raise DataError(
-            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of these, "
-            "or train without validation by data.validation=[]"
+            f"nothing to validate on: data.validation and data.split name {wanted}; found {_names(found)}; name one of "
+            "these, or train without validation by data.validation=[]"
         )
     named = config.validation if config.validation != _DEFAULT_VALIDATION else []
     absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
@@ -239,21 +235,27 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
 
 
 def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
-    """The recordings without their last parts, and these.
-
-    Raises:
-        DataError: all are too short.
-    """
-    cuts = [round((1 - share) * len(recording)) for recording in recordings]
-    long = [len(recording) - cut >= _SHORTEST_END for recording, cut in zip(recordings, cuts)]
-    if not any(long):
-        lengths = _some([f"{recording.name} ({len(recording)} frames)" for recording in recordings])
+    """The recordings without their last parts, and these."""
+    kept, ends = [], []
+    for recording in recordings:
+        cut = round((1 - share) * len(recording))
+        is_long = len(recording) - cut >= _SHORTEST_END
+        kept.append(recording.part(0, cut) if is_long else recording)
+        ends += [recording.part(cut, len(recording))] if is_long else []
+    if not ends:
         raise DataError(
             f"nothing to validate on: data.validation_share {share:g} leaves fewer than {_SHORTEST_END} frames of "
-            f"{lengths}: give longer recordings or a larger share"
+            f"{_lengths(recordings)}: give longer recordings or a larger share"
         )
-    kept = [r.part(0, cut) if is_long else r for r, cut, is_long in zip(recordings, cuts, long)]
-    return kept, [r.part(cut, len(r)) for r, cut, is_long in zip(recordings, cuts, long) if is_long]
+    return kept, ends
+
+
+def _lengths(recordings: Sequence[Recording]) -> str:
+    return _some([f"{recording.name} ({len(recording)} frames)" for recording in recordings])
+
+
+def _names(recordings: Sequence[Recording]) -> str:
+    return _some([recording.name for recording in recordings])
 
 
 def _some(names: Sequence[str]) -> str:

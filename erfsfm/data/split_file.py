@@ -35,20 +35,12 @@ class Split(Section):
         return [name if match is None else match["recording"] for name, match in matches]
 
     def test_frames(self) -> list[tuple[str, int]]:
-        """Every single frame to test on: its recording and number.
-
-        Raises:
-            DataError: a recording is named without frames, or its runs are malformed.
-        """
+        """Every single frame to test on: its recording and number."""
         return [frame for name in self.test for frame in _frames(name)]
 
 
 def read_split_file(name_or_path: str) -> Split:
-    """Read a shipped split by its name, or a file.
-
-    Raises:
-        DataError: neither, not YAML, or other keys than these; one line.
-    """
+    """Read a shipped split by its name, or a file."""
     path = Path(name_or_path)
     if not path.is_file():
         shipped = {file.stem: file for folder in _folders() for file in sorted(folder.glob("*.yaml"))}

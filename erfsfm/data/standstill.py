@@ -47,11 +47,7 @@ def _still(recording: Recording) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=1)
 def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
-    """``(N,)`` in m/s, NaN where unknown; the cameras of a drive share them.
-
-    Raises:
-        DataError: no packet can be read.
-    """
+    """``(N,)`` in m/s, NaN where unknown; the cameras of a drive share them."""
     speeds = np.full(frames, np.nan)
     reasons = []
     for index in range(frames):

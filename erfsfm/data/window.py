@@ -1,10 +1,14 @@
-"""Windows of consecutive frames; a file that cannot be read costs the windows that hold it, not a night of training."""
+"""Windows of consecutive frames, and what is known of them.
+
+A file that cannot be read costs the windows that hold it, not a night of training.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -16,6 +20,7 @@ from erfsfm.data.recordings import Recording
 
 logger = logging.getLogger(__name__)
 
+HEIGHTS = 10.0  # camera heights in the networks' unit of depth: steps are then as small as initial outputs
 _MOST_IN_A_ROW = 20
 _MOST_NAMED = 10
 
@@ -30,33 +35,26 @@ class Snippet:
     first: int
 
 
-class SnippetReader:
-    """Reads snippets and passes over those that cannot be read; each reason is logged once, the first ten of them."""
+@dataclass(frozen=True)
+class TeacherStructure:
+    """What is known of depth and motion of a snippet, as labels for both networks, in heights of the camera.
 
-    def __init__(self) -> None:
-        self._named: set[str] = set()
+    Attributes:
+        T_source_target: ``(N, 4, 4)``, NaN where nothing is known.
+        least: smallest inverse depth that agrees with what is known, ``(H, W)``, 0 where unbounded.
+        most: largest one, infinite where unbounded.
+    """
 
-    def first_readable(self, snippets: Iterator[Snippet], read: Callable[[Snippet], T]) -> tuple[Snippet, T]:
-        """The first snippet that can be read, and what was read of it.
+    T_source_target: NDArray[np.float32]
+    least: NDArray[np.floating]
+    most: NDArray[np.floating]
 
-        Raises:
-            DataError: 20 in a row cannot.
-        """
-        for _ in range(_MOST_IN_A_ROW):
-            snippet = next(snippets)
-            try:
-                return snippet, read(snippet)
-            except DataError as error:
-                reason = str(error)
-                self._name(reason)
-        raise DataError(f"{_MOST_IN_A_ROW} snippets in a row cannot be read, the last: {reason}")
 
-    def _name(self, reason: str) -> None:
-        if reason in self._named or len(self._named) >= _MOST_NAMED:
-            return
-        self._named.add(reason)
-        more = "; more files are not named" if len(self._named) == _MOST_NAMED else ""
-        logger.warning("%s: snippets with it are passed over%s", reason, more)
+def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int) -> NDArray[np.float64]:
+    """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at pose ``first`` of ``(frames, 4, 4)``."""
+    target = first + sources // 2
+    others = np.delete(np.arange(first, first + sources + 1), sources // 2)
+    return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target])
 
 
 def load_window(cache: ImageCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
@@ -64,12 +62,25 @@ def load_window(cache: ImageCache, snippet: Snippet, length: int) -> list[NDArra
     return [cache.image(snippet.recording, snippet.first + k) for k in range(length)]
 
 
-def readable(snippets: list[Snippet], read: Callable[[Snippet], object]) -> list[Snippet]:
-    """The snippets that can be read; of the others one warning.
+def first_readable(snippets: Iterator[Snippet], read: Callable[[Snippet], T], named: set[str]) -> tuple[Snippet, T]:
+    """The first snippet that can be read, and what was read of it; ``DataError`` where 20 in a row cannot.
 
-    Raises:
-        DataError: none can.
+    The reasons of those passed over are logged once each, the first ten of them, which ``named`` remembers.
     """
+    for snippet in islice(snippets, _MOST_IN_A_ROW):
+        try:
+            return snippet, read(snippet)
+        except DataError as error:
+            reason = str(error)
+            if reason not in named and len(named) < _MOST_NAMED:
+                named.add(reason)
+                more = "; more files are not named" if len(named) == _MOST_NAMED else ""
+                logger.warning("%s: snippets with it are passed over%s", reason, more)
+    raise DataError(f"{_MOST_IN_A_ROW} snippets in a row cannot be read, the last: {reason}")
+
+
+def readable(snippets: list[Snippet], read: Callable[[Snippet], object]) -> list[Snippet]:
+    """The snippets that can be read; of the others one warning, and ``DataError`` where none can."""
     kept, reasons = [], []
     for snippet in snippets:
         try:
@@ -80,10 +91,8 @@ def readable(snippets: list[Snippet], read: Callable[[Snippet], object]) -> list
     if reasons and not kept:
         raise DataError(f"no snippet to validate on can be read: {reasons[0]}")
     if reasons:
+        total, left_out = len(snippets), len(reasons)
         logger.warning(
-            "%d of %d snippets to validate on cannot be read and are left out: %s",
-            len(reasons),
-            len(snippets),
-            reasons[0],
+            "%d of %d snippets to validate on cannot be read and are left out: %s", left_out, total, reasons[0]
         )
     return kept

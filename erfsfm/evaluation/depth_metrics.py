@@ -67,9 +67,6 @@ def depth_errors(
 
     Returns:
         The errors, or None where no pixel has truth.
-
-    Raises:
-        ValueError: the maps differ in size.
     """
     if predicted.shape != true_depth.shape:
         raise ValueError(f"predicted depth must have the truth's shape {true_depth.shape}; got {predicted.shape}")
@@ -117,11 +114,7 @@ def mean_ratio(values: Sequence[float], to: Sequence[float]) -> tuple[float, flo
 
 
 def mean_errors(errors: list[DepthErrors]) -> DepthErrors:
-    """Mean over images, each image counting once.
-
-    Raises:
-        ValueError: no image.
-    """
+    """Mean over images, each image counting once."""
     if not errors:
         raise ValueError("no image with true depth to average over")
     columns = {key: float(np.mean([e.as_dict()[key] for e in errors])) for key in errors[0].as_dict()}

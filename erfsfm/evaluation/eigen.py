@@ -36,9 +36,6 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
     Args:
         split: ``eigen``, a file of the list ``test``, or any other file with a frame a line.
         root: of KITTI raw: the folder of the dates, a date, or a drive.
-
-    Raises:
-        DataError: the file is missing, empty or malformed.
     """
     base = _root_of_dates(root)
     path = Path(split)
@@ -78,9 +75,6 @@ def eigen_protocol(
     Returns:
         Rows ``gt-median`` and ``pose`` of the networks; ``pose`` multiplies depth by the mean over a window's sources
         of true over predicted distance. Then ``gt-median`` of a baseline that uses no image: a flat road, cut at 20 m.
-
-    Raises:
-        DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
     """
     frames = read_split(split, root)
     leak = refuse_leak(networks, [frame.name for frame in frames], allow_leak)
@@ -145,12 +139,8 @@ def _scale_of_motion(networks: RawNetworks, frame: RawFrame, fidelity: Fidelity)
 def _row(method: str, scaling: str, errors: Sequence[DepthErrors], wanted: int, leak: bool) -> dict[str, Any]:
     row: dict[str, Any] = {"method": method, "scaling": scaling}
     if not errors:
-        return row | {
-            "abs_rel": None,
-            "abs_rel_reason": "the car stands still in every frame",
-            "images": 0,
-            "leak": leak,
-        }
+        row |= {"abs_rel": None, "abs_rel_reason": "the car stands still in every frame"}
+        return row | {"images": 0, "leak": leak}
     mean = mean_errors(list(errors)).as_dict()
     row |= {key: value if np.isfinite(value) else None for key, value in mean.items()}
     row |= {f"{key}_reason": "an image has no scale" for key, value in mean.items() if not np.isfinite(value)}

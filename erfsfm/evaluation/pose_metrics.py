@@ -51,9 +51,6 @@ def snippet_errors(
         T_first_k_pred: predicted poses ``(S, K, 4, 4)``, any scale.
         T_first_k_true: true poses ``(S, K, 4, 4)``.
         fidelity: ``paper`` adds the four zero rows that the reference code averages over.
-
-    Raises:
-        ValueError: if the shapes differ or there is no snippet.
     """
     predicted = np.asarray(T_first_k_pred, dtype=np.float64)
     truth = np.asarray(T_first_k_true, dtype=np.float64)
@@ -93,9 +90,6 @@ def snippet_from_network(T_source_target: FloatArray) -> FloatArray:
 
     Returns:
         ``T_first_k`` ``(..., N + 1, 4, 4)``.
-
-    Raises:
-        ValueError: if the target is not in the middle of the sources.
     """
     sources = np.asarray(T_source_target, dtype=np.float64)
     if sources.ndim < 3 or sources.shape[-2:] != (4, 4) or sources.shape[-3] % 2 or not sources.shape[-3]:

@@ -73,9 +73,6 @@ def depth_protocol(
         uses no image. Of several streets these are means, ``abs_rel_se`` is the standard error over streets, and rows
         for each street follow. ``ratio`` is ``abs_rel`` over that of the first networks on the same street, of
         several streets the geometric mean, with its standard error over streets ``ratio_se``.
-
-    Raises:
-        DataError: no true depth under a root, or a leak that was not allowed.
     """
     streets = [street for root in roots for street in find_streets(root)]
     leaks = {
@@ -148,20 +145,12 @@ def pose_protocol(
 
     No snippet spans a gap, and a stretch between gaps that is shorter than one is passed over. In paper fidelity the
     truth is that of camera 0, whichever camera took the images.
-
-    Raises:
-        DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
-            not allowed.
     """
     return [row for name in sequences for row in _pose_rows(networks, root, name, fidelity, allow_leak)]
 
 
 def named_recordings(root: Path, name: str) -> list[Recording]:
-    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera.
-
-    Raises:
-        DataError: the sequence is missing, or has none of the frames.
-    """
+    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera."""
     found: dict[str, list[Recording]] = {}
     for each in discover(root):
         for known in {each.name, each.sequence or each.name}:
@@ -233,11 +222,7 @@ def _depth_row(method: str, streets: list[list[DepthErrors]], before: list[list[
 
 
 def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: bool) -> bool:
-    """Whether some of the frames were trained on.
-
-    Raises:
-        DataError: they were, and that was not allowed.
-    """
+    """Whether some of the frames were trained on; ``DataError`` where that was not allowed."""
     leaked = networks.leaks(names)
     if leaked and not allow_leak:
         some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from erfsfm.common.readers.kitti import (
     VELO_TO_CAM,
     CalibrationFile,
     FloatArray,
+    read_velodyne,
     velocity,
 )
 from erfsfm.config import Fidelity
@@ -50,11 +50,7 @@ class RawFrame:
 
     @staticmethod
     def parse(line: str, root: Path) -> RawFrame:
-        """Read a line of a split: an image's path, or ``drive frame`` with an optional ``l`` or ``r``.
-
-        Raises:
-            DataError: neither.
-        """
+        """Read a line of a split: an image's path, or ``drive frame`` with an optional ``l`` or ``r``."""
         match = _FRAME.fullmatch(line.strip())
         if match is None:
             raise DataError(f"'{line.strip()}' names no frame: wanted the path of an image, or 2011_09_26_drive_0013 5")
@@ -72,11 +68,7 @@ class RawFrame:
         return self.root / self.drive[:10] / f"{self.drive}_sync"
 
     def image_path(self, index: int | None = None) -> Path:
-        """The image of a frame of this drive, its own if None: png or jpg, whichever there is.
-
-        Raises:
-            DataError: neither is there.
-        """
+        """The image of a frame of this drive, its own if None: png or jpg, whichever there is."""
         stem = self.folder / f"image_0{self.camera}" / "data" / f"{self.index if index is None else index:010d}"
         for suffix in (".png", ".jpg"):
             if stem.with_suffix(suffix).is_file():
@@ -84,11 +76,7 @@ class RawFrame:
         raise DataError(f"{stem}.png (or .jpg) is missing: download the drive, or take the frame out of the split")
 
     def window(self, sources: int) -> list[int]:
-        """The frame with ``sources`` others around it, shifted where the drive begins or ends.
-
-        Raises:
-            DataError: the drive is shorter.
-        """
+        """The frame with ``sources`` others around it, shifted where the drive begins or ends."""
         folder = self.folder / f"image_0{self.camera}" / "data"
         count = sum(1 for path in folder.iterdir() if path.suffix in (".png", ".jpg")) if folder.is_dir() else 0
         half = sources // 2
@@ -111,22 +99,19 @@ def lidar_depth(frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "de
 
     Returns:
         Metres ``(H, W)``, 0 where there is no point.
-
-    Raises:
-        DataError: scan or calibration is missing or malformed, or the image has another shape than the camera.
     """
     height, width = size
-    to_pixels = _projection(frame, size)  # (3, 4)
-    path = frame.folder / "velodyne_points" / "data" / f"{frame.index:010d}.bin"
+    date, path = frame.folder.parent, frame.folder / "velodyne_points" / "data" / f"{frame.index:010d}.bin"
+    camera = CalibrationFile(date / CAM_TO_CAM)
+    R_rect = np.eye(4)
+    R_rect[:3, :3] = camera.matrix("R_rect_00", (3, 3))
+    T_cam_velo = CalibrationFile(date / VELO_TO_CAM).transform("R", "T")
+    to_pixels = _rectified_camera(camera, frame, size) @ R_rect @ T_cam_velo
     if not path.is_file():
         raise DataError(f"{path} is missing: the true depth of the split's frames comes from the LiDAR")
-    numbers = np.fromfile(path, dtype=np.float32)
-    if numbers.size % 4:
-        raise DataError(f"{path} must hold four numbers a point; it is damaged")
-    points = numbers.reshape(-1, 4).astype(np.float64)
+    points = read_velodyne(path)
     points = points[points[:, 0] >= 0]
-    points[:, 3] = 1
-    projected = points @ to_pixels.T
+    projected = points @ to_pixels[:, :3].T + to_pixels[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         places = np.round(projected[:, :2] / projected[:, 2:]) - 1
     z = projected[:, 2]
@@ -137,19 +122,9 @@ def lidar_depth(frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "de
 
 
 def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
-    """Distance in metres from a window's middle frame to each of the others, by the velocity of its GPS/IMU.
+    """Distances in metres ``(N,)`` from a window's middle frame to the others, by the velocity of its GPS/IMU.
 
-    Trapezoids over (north, east, up) velocities, as the reference does.
-
-    Args:
-        frame: of the drive.
-        window: consecutive frame numbers.
-
-    Returns:
-        ``(N,)`` in time order, the middle left out.
-
-    Raises:
-        DataError: a file is missing or malformed.
+    Trapezoids over (north, east, up) velocities, as the reference does; ``window`` are consecutive frame numbers.
     """
     folder = frame.folder / "oxts"
     path = folder / "timestamps.txt"
@@ -157,9 +132,10 @@ def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
         raise DataError(f"{path} is missing: how far the car moved needs a date and a time a frame")
     stamps = path.read_text().split("\n")
     try:
-        seconds = np.array([_seconds(stamps[i]) for i in window])
+        times = np.array([stamps[i].strip() for i in window], "datetime64[ns]")
     except (ValueError, IndexError) as error:
         raise DataError(f"{path} must hold a date and a time a frame: {' '.join(str(error).split())}") from error
+    seconds = (times - times[0]) / np.timedelta64(1, "s")
     speeds = np.stack([velocity(folder / "data", i) for i in window])
     steps = 0.5 * (speeds[:-1] + speeds[1:]) * np.diff(seconds)[:, None]
     places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -189,26 +165,11 @@ def _nearest(
 
 
 def flat_road_depth(frame: RawFrame, size: tuple[int, int], farthest_m: float) -> NDArray[np.float32]:
-    """z-depth in metres ``(H, W)`` of a flat road under a level camera, and ``farthest_m`` where that is farther.
-
-    Raises:
-        DataError: the calibration is missing or incomplete, or of another camera.
-    """
+    """z-depth in metres ``(H, W)`` of a flat road under a level camera, and ``farthest_m`` where that is farther."""
     camera = _rectified_camera(CalibrationFile(frame.folder.parent / CAM_TO_CAM), frame, size)
     below_horizon = np.arange(1, size[0] + 1) - camera[1, 2]
     depth = camera[1, 1] * CAMERA_HEIGHT_M / np.maximum(below_horizon, 1e-9)
     return np.repeat(np.minimum(depth, farthest_m).astype(np.float32)[:, None], size[1], axis=1)
-
-
-def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
-    """LiDAR points to pixels that count from one, ``(3, 4)``, at the image's size."""
-    date = frame.folder.parent
-    camera = CalibrationFile(date / CAM_TO_CAM)
-    T_cam_velo = CalibrationFile(date / VELO_TO_CAM).transform("R", "T")
-    R_rect = np.eye(4)
-    R_rect[:3, :3] = camera.matrix("R_rect_00", (3, 3))
-    projection: FloatArray = _rectified_camera(camera, frame, size) @ R_rect @ T_cam_velo
-    return projection
 
 
 def _rectified_camera(camera: CalibrationFile, frame: RawFrame, size: tuple[int, int]) -> FloatArray:
@@ -223,8 +184,3 @@ def _rectified_camera(camera: CalibrationFile, frame: RawFrame, size: tuple[int,
     resize = np.array([[scale_x, 0, (1 - scale_x) / 2], [0, scale_y, (1 - scale_y) / 2], [0, 0, 1]])
     rectified: FloatArray = resize @ P_rect
     return rectified
-
-
-def _seconds(stamp: str) -> float:
-    """``2011-09-26 13:10:51.175862102``; nanoseconds are cut to microseconds."""
-    return datetime.strptime(stamp.strip()[:26], "%Y-%m-%d %H:%M:%S.%f").timestamp()

@@ -45,11 +45,7 @@ class Street:
 
 
 def find_streets(root: Path) -> list[Street]:
-    """Every street under a root: all pairs of a folder, every fifth frame of a recording or a drive.
-
-    Raises:
-        DataError: there is none, or depth maps of different sizes.
-    """
+    """Every street under a root: all pairs of a folder, every fifth frame of a recording or a drive."""
     if not root.exists():
         raise DataError(f"no data set at {root}: the path does not exist")
     streets = _of_pairs(root) or _of_drives(root) or _of_recordings(root)

@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from erfsfm.config import ExperimentConfig, LossConfig
+from erfsfm.data.window import HEIGHTS
 from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import Projection, pose_vector_to_matrix, project_into_source, sample
-from erfsfm.labels.structure import HEIGHTS
 from erfsfm.losses.photometric import edge_aware_smoothness, photometric_error, second_order_smoothness
 from erfsfm.losses.structure import (
     Bounds,
@@ -30,7 +30,7 @@ class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(S, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
     The sources are of the last S targets; the others are single images with bounds of their depth. S may be 0.
-    Labels of the teacher (`erfsfm.labels.structure`), where one is used: ``T_source_target``
+    Labels of the teacher (`erfsfm.data.window`), where one is used: ``T_source_target``
     ``(S, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the B targets' inverse depth.
     With simulated weather: ``shown`` ``(S, N + 1, 3, H, W)``, all images in time order as the networks get them.
     """

@@ -49,15 +49,17 @@ def open_sequence(
         camera: a ``camera.yaml``, or ``fov=DEGREES``; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
         truth: its true poses, in place of those that the data set has.
-
-    Raises:
-        SequenceError: one line on what was searched, where, what was found and what to do.
     """
     if dataset is None and name is None:
         for what, given in (("a camera file", camera), ("a file of true poses", truth)):
             if given is not None:
                 raise SequenceError(f"{what} ({given}) without a data set: give --dataset as well")
-        sequence = _open_embedded()
+        # rendering needs Open3D, which is slow to import
+        from slam.sequences.simulated import SimulatedSequence
+        from slam.simulation.options import SimulationOptions
+
+        options = SimulationOptions(route="loop", frames=EMBEDDED_FRAMES, seed=EMBEDDED_SEED)
+        sequence: RecordedSequence = SimulatedSequence(options)
     else:
         root = _root(dataset, name)
         sequence = _choose(root, Asked(name, camera))
@@ -76,14 +78,6 @@ def sequence_kinds(dataset: Path) -> dict[str, str]:
 def sequence_names(dataset: Path) -> list[str]:
     """Names of the sequences in a data set; as `sequence_kinds`."""
     return list(sequence_kinds(dataset))
-
-
-def _open_embedded() -> RecordedSequence:
-    # rendering needs Open3D, which is slow to import
-    from slam.sequences.simulated import SimulatedSequence
-    from slam.simulation.options import SimulationOptions
-
-    return SimulatedSequence(SimulationOptions(route="loop", frames=EMBEDDED_FRAMES, seed=EMBEDDED_SEED))
 
 
 def _root(dataset: Path | None, name: str | None) -> Path:

@@ -75,13 +75,7 @@ class ImageFiles:
         return len(self.files)
 
     def read(self, index: int) -> Image:
-        """One image ``(height, width, 3)`` uint8 RGB.
-
-        Raises:
-            MissingFrameError: if the frame's number is missing.
-            DataError: if the file cannot be read.
-            SequenceError: if the image has another size than that one.
-        """
+        """One image ``(height, width, 3)`` uint8 RGB; ``MissingFrameError`` where the frame's number is missing."""
         path = self._paths.get(index)
         if path is None:
             folder = self.files.paths[0].parent
@@ -107,12 +101,9 @@ def too_long(files: NumberedFiles, first: int, last: int) -> SequenceError:
 
 
 def read_depth_map(path: Path, per_metre: float = KITTI_PER_METRE, unknown: int = 0) -> FloatArray:
-    """A depth map ``(h, w)`` in metres, 0 where unknown.
+    """A depth map ``(h, w)`` in metres, 0 where unknown, from a 16-bit grey PNG.
 
-    Args:
-        path: a 16-bit grey PNG.
-        per_metre: the stored value of one metre.
-        unknown: a stored value of pixels without depth, beside 0.
+    ``per_metre`` is the stored value of one metre, ``unknown`` one of pixels without depth, beside 0.
     """
     values = read_values(path)
     if values.ndim != 2 or values.dtype != np.uint16:

@@ -186,7 +186,7 @@ def _oxts_poses(
         return None
     found = sorted(folder.glob("*.txt"))
     packets = by_number(found) if found else None
-    paths = {} if packets is None else dict(zip((packets.first + row for row in packets.rows), packets.paths))
+    paths = {int(path.stem): path for path in found}
     rows = range(len(files)) if all(files.first + row in paths for row in range(len(files))) else files.rows
     if packets is None or not all(files.first + row in paths for row in rows):
         raise SequenceError(
@@ -239,7 +239,7 @@ def _readers(
 def _distance_to_mesh(path: Path) -> Callable[[FloatArray], FloatArray] | None:
     """Distances from points ``(M, 3)``, in the frame of the first true pose, to a mesh, which is read when first asked.
 
-    None without a file; the distances raise ``SequenceError`` where it is no mesh.
+    None without a file.
     """
     if not path.is_file():
         return None

@@ -20,7 +20,7 @@ import numpy as np
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
-from erfsfm.common.readers.images import has_images, list_images
+from erfsfm.common.readers.images import first_size, has_images, list_images
 from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
 from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
@@ -28,8 +28,7 @@ from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, find_camera_file, read_explicit
-from slam.sequences.foreign_camera import pinhole_keys, read_opencv_yaml
+from slam.sequences.camera_file import beside, find_camera_file, pinhole_keys, read_explicit, read_opencv_yaml
 from slam.sequences.images import ImageFiles, read_depth_map
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import pose_files, poses_near, poses_of, read_matrix
@@ -52,7 +51,6 @@ _SEVEN_SCENES_IMAGE = re.compile(r"frame-(\d{6})\.color\.png")
 _NUSCENES_FPS = 12.0
 
 Row = dict[str, Any]
-OwnCamera = Callable[[ImageFiles], CameraFile]
 
 
 def _recorded(
@@ -62,7 +60,7 @@ def _recorded(
     stamps: FloatArray,
     asked: Path | None,
     places: Sequence[Path],
-    own: OwnCamera | None,
+    own: Callable[[], CameraFile] | None,
     first: int = 0,
     **beside_images: Any,
 ) -> RecordedSequence:
@@ -71,8 +69,7 @@ def _recorded(
     ``places`` may have a ``camera.yaml``; ``own`` reads the calibration of the data set.
     """
     stored = ImageFiles(files)
-    calibration = None if own is None else partial(own, stored)
-    camera = find_camera_file(asked, *places, wanted_by=f"{name} in {places[0]}", images=stored, own=calibration)
+    camera = find_camera_file(asked, *places, wanted_by=f"{name} in {places[0]}", images=stored, own=own)
     sources = (Source(f"{data_set}/{name}", first=first),)
     return RecordedSequence(name, stored, camera, stamps, sources, **beside_images)
 
@@ -80,19 +77,19 @@ def _recorded(
 def _index(table: Path, folder: Path, in_nanoseconds: bool = False) -> tuple[FloatArray, list[Path]]:
     """Stamps in seconds and files, which are in ``folder``, of a table of both, good rows in the order of time."""
     wanted = "'nanoseconds,file'" if in_nanoseconds else "'stamp file'"
-    bad = BadRows(table, SequenceError)
-    rows: list[tuple[int, float, Path]] = []
+    bad, numbers, stamps, files = BadRows(table, SequenceError), [], [], []
     for number, line in rows_of(table, SequenceError, f"rows of {wanted}"):
         words = line.replace(",", " ").split() or [""]
         is_whole = in_nanoseconds and words[0].isdecimal()
         stamp = int(words[0]) / 10**9 if is_whole else number_or_nan(in_seconds(words[0]))
         if len(words) == 2 and math.isfinite(stamp):
-            rows.append((number, stamp, folder / words[1]))
+            numbers.append(number)
+            stamps.append(stamp)
+            files.append(folder / words[1])
         else:
             bad.add(number, f"{line!r} is not {wanted}")
-    stamps = np.array([stamp for _, stamp, _ in rows])
-    order = bad.in_order(stamps, "stamps", np.array([number for number, _, _ in rows], np.intp), f"rows of {wanted}")
-    return stamps[order], [rows[k][2] for k in order]
+    order = bad.in_order(np.array(stamps), "stamps", np.array(numbers, np.intp), f"rows of {wanted}")
+    return np.array(stamps)[order], [files[k] for k in order]
 
 
 def _depth_maps(paths: list[Path], unknown: int = 0) -> dict[int, ArrayReader]:
@@ -129,9 +126,8 @@ def _open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
     stamps = stamps[files.first :][: len(files)]
     truth = _euroc_truth(body, stamps, sensor)
     places = body, body.parent
-    return _recorded(
-        "euroc", body.parent.name, files, stamps, asked, places, lambda _: read_explicit(sensor), T_any_camera=truth
-    )
+    own = partial(read_explicit, sensor)
+    return _recorded("euroc", body.parent.name, files, stamps, asked, places, own, T_any_camera=truth)
 
 
 def _euroc_truth(body: Path, stamps: FloatArray, camera: Path) -> FloatArray | None:
@@ -165,18 +161,18 @@ def _T_body_sensor(path: Path) -> FloatArray:
 # TUM RGB-D: rgb.txt and, where known, groundtruth.txt and depth.txt
 
 
-def _freiburg(focal: tuple[float, float], centre: tuple[float, float], *distortion: float) -> CameraFile:
-    (fx, fy), (cx, cy) = focal, centre
-    camera = CameraFile(width=640, height=480, fx=fx, fy=fy, cx=cx, cy=cy, fps=30.0)
-    return camera.model_copy(update={"model": "opencv", "distortion": distortion}) if distortion else camera
-
-
-# the benchmark's table of its three cameras; images of freiburg3 are undistorted
+# the benchmark's table of its three cameras: fx, fy, cx, cy and the distortion; images of freiburg3 are undistorted
 _FREIBURG_CAMERAS = {
-    "1": _freiburg((517.3, 516.5), (318.6, 255.3), 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
-    "2": _freiburg((520.9, 521.0), (325.1, 249.7), 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    "3": _freiburg((535.4, 539.2), (320.1, 247.6)),
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
+
+
+def _freiburg_camera(number: str) -> CameraFile:
+    pinhole, distortion = _FREIBURG_CAMERAS[number]
+    lens = {"model": "opencv", "distortion": distortion} if distortion else {}
+    return camera_of(pinhole_keys(640, 480, *pinhole, fps=_FPS, **lens), f"freiburg{number}")
 
 
 def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
@@ -185,9 +181,8 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
     files = by_table(listed, folder / _TUM_INDEX)
     stamps = stamps[files.first :][: len(files)]
     places, match = (folder, folder.parent), _FREIBURG.search(folder.name)
-    own: OwnCamera | None = None
-    if match is not None and beside(*places) is None:
-        own = lambda _: _FREIBURG_CAMERAS[match["camera"]]  # noqa: E731
+    is_published = match is not None and beside(*places) is None
+    own = partial(_freiburg_camera, match["camera"]) if match is not None and is_published else None
     depth_maps = {}
     if (folder / _TUM_DEPTH).exists():
         known, paths = _index(folder / _TUM_DEPTH, folder)
@@ -218,7 +213,7 @@ def _open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
     return _recorded("tum_mono", folder.name, files, stamps, asked, [folder], own, T_any_camera=truth)
 
 
-def _fov_camera(path: Path, fps: float, images: ImageFiles) -> CameraFile:
+def _fov_camera(path: Path, fps: float) -> CameraFile:
     """Focal lengths and principal point over the image's size, and the angle of the lens; then the size."""
     try:
         first, second = read_text(path).splitlines()[:2]
@@ -252,7 +247,7 @@ def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
         stamps,
         asked,
         (folder, folder.parent),
-        lambda _: CameraFile(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS),
+        lambda: CameraFile(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS),
         numbers[0],
         T_any_camera=pose_files([frame.with_suffix(".pose.txt") for frame in frames], stamps),
         depth_maps=_depth_maps([frame.with_suffix(".depth.png") for frame in frames], _SEVEN_SCENES_UNKNOWN),
@@ -279,7 +274,7 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
         stamps,
         asked,
         [folder],
-        partial(_scannet_camera, folder / _SCANNET_CAMERA),
+        partial(_scannet_camera, folder / _SCANNET_CAMERA, files),
         numbers[0],
         T_any_camera=pose_files([folder / "pose" / f"{k}.txt" for k in numbers], stamps),
         depth_maps=_depth_maps([folder / "depth" / f"{k}.png" for k in numbers]),
@@ -289,10 +284,9 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
 _SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
 
 
-def _scannet_camera(path: Path, images: ImageFiles) -> CameraFile:
-    K = read_matrix(path, "a camera")
-    pinhole = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    return camera_of(pinhole_keys(images.width, images.height, *pinhole, fps=_FPS), str(path))
+def _scannet_camera(path: Path, files: NumberedFiles) -> CameraFile:
+    K, (height, width) = read_matrix(path, "a camera"), first_size(files.paths)
+    return camera_of(pinhole_keys(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], fps=_FPS), str(path))
 
 
 # nuScenes: the tables v1.0-*/scene.json and others, with microseconds
@@ -330,7 +324,7 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         stamps,
         asked,
         [root],
-        lambda _: camera_of(keys, str(tables / "calibrated_sensor.json")),
+        partial(camera_of, keys, str(tables / "calibrated_sensor.json")),
         files.first,
         T_any_camera=T_any_camera,
         T_camera_lidar=T_camera_lidar,

@@ -36,8 +36,7 @@ def rebased(T_any_camera: FloatArray) -> FloatArray:
 def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
     """Poses ``(N, 4, 4)`` of positions ``(N, 3)`` and quaternions ``(N, 4)``, which are normalised.
 
-    Raises:
-        ValueError: the length of a quaternion is not 1, or a position is not finite or farther than 1e12.
+    ``ValueError``: the length of a quaternion is not 1, or a position is not finite or farther than 1e12.
     """
     if not (np.abs(positions) <= _FARTHEST).all():
         raise ValueError(f"a position is not finite, or farther than {_FARTHEST:g}")
@@ -49,16 +48,10 @@ def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
 
 
 def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path) -> FloatArray:
-    """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from poses ``(M, 4, 4)`` at increasing stamps ``(M,)``.
+    """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from ``(M, 4, 4)`` of ``path`` at known stamps ``(M,)``.
 
     The motion goes on at both ends. NaN, with a warning, where the nearest known pose is more than 0.1 s away; of poses
     as rare as images a missing one is bridged, up to 0.3 s.
-
-    Args:
-        T_any_camera: what is known, from ``path``.
-        known: its stamps in seconds.
-        stamps: those of the images.
-        path: for the warning.
     """
     if np.array_equal(known, stamps):
         return T_any_camera
@@ -101,18 +94,16 @@ def pose_files(paths: list[Path], stamps: FloatArray) -> FloatArray | None:
 
     Numbers that are not finite are those of a camera that lost track.
     """
+    there = [(stamp, path, read_matrix(path, "a pose")) for stamp, path in zip(stamps, paths) if path.exists()]
     known, poses = [], []
-    for stamp, path in zip(stamps, paths):
-        if not path.exists():
-            continue
-        pose = read_matrix(path, "a pose")
+    for stamp, path, pose in there:
         if not np.isfinite(pose).all():
             continue
         if not se3.is_se3(pose, _ROTATION_TOLERANCE):
             raise SequenceError(f"{path} holds no pose: its 3 x 3 part is not a rotation")
         known.append(stamp)
         poses.append(se3.rigid(pose))
-    if not any(path.exists() for path in paths):
+    if not there:
         return None
     return poses_near(np.array(poses).reshape(-1, 4, 4), np.array(known), stamps, paths[0].parent)
 

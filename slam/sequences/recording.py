@@ -96,15 +96,10 @@ class RecordedSequence:
     recorded: int = field(init=False)
 
     def __post_init__(self, usual_height_m: float | None) -> None:
-        """Check images, camera and stamps against each other, and rebase the poses.
-
-        Raises:
-            SequenceError: the images have another size than the camera, or its lens cannot be undistorted; a gap in
-                their numbers is too long; the stamps cannot be seconds; the LiDAR's calibration is not rigid.
-        """
+        """Check images, camera and stamps against each other, and rebase the poses."""
         where = self.name
         if isinstance(self.images, ImageFiles):
-            require_short_gaps(self.images.files, self.stamps)
+            _require_short_gaps(self.images.files, self.stamps)
             where = f"{self.name} in {self.images.files.paths[0].parent}"
         if isinstance(self.camera, CameraFile):
             require_size(self.images, self.camera, where)
@@ -131,23 +126,23 @@ class RecordedSequence:
         return part
 
     def take_truth(self, T_any_camera: FloatArray | None) -> None:
-        """Let these be the true poses."""
+        """Let these be the true poses; a warning where no camera can follow them, such as millimetres, or a jump."""
         self.T_any_camera, self.reference = T_any_camera, None
         self.reference = self.true_poses(0, len(self))
-        if self.reference is not None:
-            _doubt_speed(self.name, self.reference, self.stamps)
+        if self.reference is None:
+            return
+        speeds = np.linalg.norm(np.diff(self.reference[:, :3, 3], axis=0), axis=1) / np.diff(self.stamps)
+        fast = np.flatnonzero(speeds > FASTEST_M_S)
+        if fast.size:
+            text = "%s: its true poses move at %g m/s after frame %d: check their unit, and the stamps"
+            logger.warning(text, self.name, speeds[fast[0]], fast[0])
 
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
-        """Read one frame.
-
-        Raises:
-            MissingFrameError: if its number is missing from the files.
-            SequenceError: if its image cannot be read.
-        """
+        """Read one frame; ``MissingFrameError`` where its number is missing from the files."""
         if not 0 <= index < len(self):
             raise SequenceError(f"no frame {index} in sequence {self.name}: it has frames 0 to {len(self) - 1}")
         with sequence_errors():
@@ -214,19 +209,6 @@ def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
         logger.warning("%s: its stamps pause for %g s before frame %d", name, longest, int(periods.argmax()) + 1)
 
 
-def _doubt_speed(name: str, reference: FloatArray, stamps: FloatArray) -> None:
-    """Warn of true poses that no camera can follow, such as millimetres, or a jump."""
-    speeds = np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1) / np.diff(stamps)
-    fast = np.flatnonzero(speeds > FASTEST_M_S)
-    if fast.size:
-        logger.warning(
-            "%s: its true poses move at %g m/s after frame %d: check their unit, and the stamps",
-            name,
-            speeds[fast[0]],
-            fast[0],
-        )
-
-
 def frame_range(text: str, frames: int) -> tuple[int, int]:
     """Read ``A:B`` as Python reads a slice of so many frames: half-open, either end optional or negative.
 
@@ -274,9 +256,6 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
             interpolated.
         path: where they were read.
         files: images, or packets of a GPS/INS.
-
-    Raises:
-        SequenceError: if their number matches none of these, or their order is ambiguous.
     """
     assigned = files.rows_of(len(stamps))
     if assigned is None:
@@ -300,19 +279,14 @@ def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     if len(order) == 1:
         bad.say(0, wanted)
     rows, times = np.sort(rows[order]), times[order]
-    period = float(np.median(np.diff(times) / np.diff(rows)))
-    reach = np.array([-len(stamps), len(stamps)])  # at both ends the rate goes on
-    times = np.r_[times[0] + reach[0] * period, times, times[-1] + reach[1] * period]
-    known = np.r_[rows[0] + reach[0], rows, rows[-1] + reach[1]]
+    beyond, period = len(stamps), float(np.median(np.diff(times) / np.diff(rows)))  # at both ends the rate goes on
+    times = np.r_[times[0] - beyond * period, times, times[-1] + beyond * period]
+    known = np.r_[rows[0] - beyond, rows, rows[-1] + beyond]
     return np.asarray(np.interp(np.arange(1, len(stamps) + 1), known, times))
 
 
-def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:
-    """Warn once of missing images, and refuse gaps too long to be interpolated across.
-
-    Raises:
-        SequenceError: if a gap is longer than 10 seconds.
-    """
+def _require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:
+    """Warn once of missing images, and refuse gaps too long to be interpolated across."""
     for first, last in files.gaps():
         if stamps[last + 1] - stamps[first - 1] > _MAX_GAP_S:
             raise too_long(files, first, last)

@@ -63,11 +63,7 @@ class Piece(NamedTuple):
 
 
 def find_series(kinds: Mapping[str, str]) -> list[list[Piece]]:
-    """The pieces of each recording that has several, in order.
-
-    Args:
-        kinds: of recordings, by the names of their files or folders without suffix.
-    """
+    """The pieces of each recording that has several, in order; ``kinds`` are by names of files without suffix."""
     drives: dict[tuple[str, str, str], list[Piece]] = {}
     for name, kind in kinds.items():
         if piece := Piece.of(name, kind):

@@ -31,7 +31,6 @@ class Undistortion:
     """
 
     def __init__(self, camera: CameraFile) -> None:
-        """Build the look-up maps."""
         self._K = Intrinsics.of(camera.pinhole).K
         self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
         self._model = camera.model
@@ -39,12 +38,8 @@ class Undistortion:
         if zoom > _FOLDED_ZOOM:
             raise SequenceError(f"distortion {list(camera.distortion)} folds the image: {_CHECK}")
         if zoom > _UNLIKELY_ZOOM:
-            logger.warning(
-                "distortion %s leaves only the middle %.0f %% of the image's width: %s",
-                list(camera.distortion),
-                100 / zoom,
-                _CHECK,
-            )
+            text = "distortion %s leaves only the middle %.0f %% of the image's width: %s"
+            logger.warning(text, list(camera.distortion), 100 / zoom, _CHECK)
         focal = zoom * camera.fx, zoom * camera.fy
         readout_s = camera.readout_ms / 1e3
         self.intrinsics = Intrinsics(
@@ -91,8 +86,10 @@ class Undistortion:
 
     def _shortest_zoom(self, width: int, height: int) -> float:
         """Zoom out from the centre until the border of the pinhole image meets that of the lens's image."""
-        border = _border(width, height)
         corner = np.array([width - 1.0, height - 1.0])
+        v, u = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
+        at_edge = (u == 0) | (u == width - 1) | (v == 0) | (v == height - 1)
+        border = np.column_stack([u, v])[at_edge]
         zoom, radius = _ZOOM_LIMITS[1], np.zeros(len(border))
         fits = False
         while zoom > _ZOOM_LIMITS[0]:
@@ -114,12 +111,13 @@ def require_size(images: Sized, camera: CameraFile, where: str) -> None:
     """Refuse images of another size than their camera."""
     if (images.width, images.height) == (camera.width, camera.height):
         return
-    wanted = (
-        "they are turned by a quarter, perhaps by their own metadata: turn them back"
-        if (images.width, images.height) == (camera.height, camera.width)
-        else "resize the images, or if they were only resized, scale the "
-        f"file to {{{_scaled_hint(camera, images.width, images.height)}}}"
-    )
+    if (images.width, images.height) == (camera.height, camera.width):
+        wanted = "they are turned by a quarter, perhaps by their own metadata: turn them back"
+    else:
+        scaled = camera.pinhole.resized(images.width, images.height)
+        values = ", ".join(f"{name}: {getattr(scaled, name):.6g}" for name in ("fx", "fy", "cx", "cy"))
+        keys = f"width: {images.width}, height: {images.height}, {values}"
+        wanted = f"resize the images, or if they were only resized, scale the file to {{{keys}}}"
     raise SequenceError(
         f"the images of {where} are {images.width}x{images.height}, but the camera file is for "
         f"{camera.width}x{camera.height}: {wanted}"
@@ -132,17 +130,3 @@ def undistorted(camera: CameraFile) -> tuple[Intrinsics, Undistortion | None]:
         undistortion = Undistortion(camera)
         return undistortion.intrinsics, undistortion
     return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3), None
-
-
-def _scaled_hint(camera: CameraFile, width: int, height: int) -> str:
-    """The camera file scaled to images of another size, as YAML on one line."""
-    scaled = camera.pinhole.resized(width, height)
-    values = ", ".join(f"{name}: {getattr(scaled, name):.6g}" for name in ("fx", "fy", "cx", "cy"))
-    return f"width: {width}, height: {height}, {values}"
-
-
-def _border(width: int, height: int) -> FloatArray:
-    """The pixels ``(N, 2)`` of an image's outermost rows and columns."""
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    edge = (u == 0) | (u == width - 1) | (v == 0) | (v == height - 1)
-    return np.column_stack([u[edge], v[edge]])

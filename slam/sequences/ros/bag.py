@@ -34,7 +34,6 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a bag."""
         self.path = path
         self._is_ros1 = path.suffix == ".bag"
         rosbag1, rosbag2, typesys = import_extra("ros")
@@ -100,12 +99,10 @@ class Bag:
             raise
         except Exception as error:  # of whatever kind a damaged file raises inside rosbags
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            foreign = foreign_topics(self.path) if self.path.suffix == ".mcap" else []
-            if foreign:
-                held = ", ".join(foreign)
-                raise SequenceError(
-                    f"{self.path} is not of ROS: it holds {held}; convert it to a bag of ROS 2"
-                ) from error
+            held = ", ".join(foreign_topics(self.path) if self.path.suffix == ".mcap" else [])
+            if held:
+                cure = "convert it to a bag of ROS 2"
+                raise SequenceError(f"{self.path} is not of ROS: it holds {held}; {cure}") from error
             raise SequenceError(f"bag {self.path} cannot be read ({reason}): copy it again, or reindex it") from error
 
 

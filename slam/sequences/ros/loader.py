@@ -53,7 +53,6 @@ class StampedMessages:
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """Read the stamps."""
         self._bag, self.topic = bag, topic
         pairs = [(time_ns, bag.stamp_ns(data)) for time_ns, data in bag.raw(topic)]
         if not pairs:
@@ -108,10 +107,9 @@ class BagImages:
         """Read the stamps of all and the first readable images for their size."""
         self.messages = StampedMessages(bag, topic)
         self._where = f"an image of {topic} in {bag.path}"
-        self._stretch = stretch_of(
-            range(len(self)), lambda index: ros.values_of(self.messages.read(index), self._where)
-        )
-        self.height, self.width = first_usual(range(len(self))[:_SOUGHT_IMAGES], self._decode)[1].shape[:2]
+        rows = range(len(self))
+        self._stretch = stretch_of(rows, lambda index: ros.values_of(self.messages.read(index), self._where))
+        self.height, self.width = first_usual(rows[:_SOUGHT_IMAGES], self._decode)[1].shape[:2]
 
     def __len__(self) -> int:
         """Number of images."""
@@ -120,8 +118,8 @@ class BagImages:
     def read(self, index: int) -> Image:
         """One image ``(height, width, 3)`` uint8 RGB."""
         image = self._decode(index)
-        if image.shape[:2] != (self.height, self.width):
-            height, width = image.shape[:2]
+        height, width = image.shape[:2]
+        if (height, width) != (self.height, self.width):
             raise SequenceError(f"{self._where} is {width}x{height}, the first are {self.width}x{self.height}")
         return image
 
@@ -183,15 +181,11 @@ def frame_name(text: str) -> str:
 
 
 def transform_of(message: Any) -> FloatArray:
-    """``T_parent_child`` ``(4, 4)`` of a ``Transform`` or a ``Pose``.
-
-    Raises:
-        ValueError: its rotation is none, or its position is not finite.
-    """
-    t = message.translation if hasattr(message, "translation") else message.position
-    q = message.rotation if hasattr(message, "rotation") else message.orientation
-    T: FloatArray = poses_of(np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]]))[0]
-    return T
+    """``T_parent_child`` ``(4, 4)`` of a ``Transform`` or a ``Pose``; ``ValueError`` where it is none."""
+    is_pose = hasattr(message, "position")
+    t, q = (message.position, message.orientation) if is_pose else (message.translation, message.rotation)
+    (T,) = poses_of(np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]]))
+    return np.asarray(T)
 
 
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
@@ -220,11 +214,8 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
 def camera_topics(path: Path) -> list[str]:
     """Topics of a bag with pictures of a camera, not depth; rectified ones in place of the same camera's raw ones."""
     with closing(Bag(path)) as bag:
-        topics = [
-            topic
-            for topic in bag.topics(ros.IMAGE, ros.COMPRESSED_IMAGE)
-            if ros.shows_pictures(bag.first(topic), topic)
-        ]
+        images = bag.topics(ros.IMAGE, ros.COMPRESSED_IMAGE)
+        topics = [topic for topic in images if ros.shows_pictures(bag.first(topic), topic)]
     rectified = {_home(topic) for topic in topics if is_rectified(topic)}
     return [topic for topic in topics if is_rectified(topic) or _home(topic) not in rectified]
 
@@ -235,10 +226,8 @@ def _calibration(bag: Bag, topic: str, fps: float, size: tuple[int, int]) -> Cam
     base, home = topic.removesuffix("/compressed"), _home(topic)
     info = next((name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None)
     if info is None:
-        raise SequenceError(
-            f"no {home}/camera_info for {topic} in {bag.path}: it has {', '.join(known) or 'no camera_info'}; give "
-            f"--camera"
-        )
+        held = ", ".join(known) or "no camera_info"
+        raise SequenceError(f"no {home}/camera_info for {topic} in {bag.path}: it has {held}; give --camera")
     return ros.camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
 
 
@@ -301,9 +290,8 @@ def _scans(
         if T_camera_lidar is None:
             logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
             continue
-        clouds = StampedMessages(bag, topic)
+        clouds, where = StampedMessages(bag, topic), f"a cloud of {topic} in {bag.path}"
         pairs = zip(*nearest_pairs(stamps, clouds.stamps, _SCAN_DELAY_S))
-        where = f"a cloud of {topic} in {bag.path}"
         return T_camera_lidar, {int(frame): partial(clouds.points, int(cloud), where) for frame, cloud in pairs}
     return None, {}
 

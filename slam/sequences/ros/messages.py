@@ -14,21 +14,18 @@ from erfsfm.common.readers.images import Stretch, decode_image, decode_values
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.foreign_camera import lens_model, pinhole_keys
+from slam.sequences.camera_file import lens_model, pinhole_keys
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 
+SIXTEEN_BITS = ("mono16", "16UC1")
 _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenCV's conversion to RGB
     "rgb8": (3, None),
-    "8UC3": (3, cv2.COLOR_BGR2RGB),
-    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    **dict.fromkeys(("8UC3", "bgr8"), (3, cv2.COLOR_BGR2RGB)),
     "rgba8": (4, cv2.COLOR_RGBA2RGB),
     "bgra8": (4, cv2.COLOR_BGRA2RGB),
-    "mono8": (1, cv2.COLOR_GRAY2RGB),
-    "8UC1": (1, cv2.COLOR_GRAY2RGB),
-    "mono16": (1, cv2.COLOR_GRAY2RGB),
-    "16UC1": (1, cv2.COLOR_GRAY2RGB),
+    **dict.fromkeys(("mono8", "8UC1", *SIXTEEN_BITS), (1, cv2.COLOR_GRAY2RGB)),
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
@@ -36,7 +33,6 @@ _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenC
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
-SIXTEEN_BITS = ("mono16", "16UC1")
 _FLOAT32 = 7  # PointField.FLOAT32
 
 
@@ -56,9 +52,7 @@ def values_of(message: Any, where: str) -> NDArray[Any]:
     if encoding not in _CONVERSIONS:
         raise SequenceError(f"{where} has encoding {encoding}; known are {', '.join(_CONVERSIONS)}")
     channels, _ = _CONVERSIONS[encoding]
-    sample = np.dtype(np.uint16 if encoding in SIXTEEN_BITS else np.uint8).newbyteorder(
-        ">" if message.is_bigendian else "<"
-    )
+    sample = np.dtype(f"{'>' if message.is_bigendian else '<'}u{2 if encoding in SIXTEEN_BITS else 1}")
     height, width, step = message.height, message.width, message.step
     row = width * channels * sample.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
@@ -126,15 +120,8 @@ def points_of(cloud: Any, where: str) -> FloatArray:
     data: NDArray[np.uint8] = np.asarray(cloud.data, dtype=np.uint8)
     if len(data) < count * step:
         raise DataError(f"{where} has {len(data)} bytes for {count} points of {step}")
-    order = ">" if cloud.is_bigendian else "<"
-    layout = np.dtype(
-        {
-            "names": ["x", "y", "z"],
-            "formats": [f"{order}f4"] * 3,
-            "offsets": [offsets[k] for k in "xyz"],
-            "itemsize": step,
-        }
-    )
+    formats, places = [f"{'>' if cloud.is_bigendian else '<'}f4"] * 3, [offsets[axis] for axis in "xyz"]
+    layout = np.dtype({"names": list("xyz"), "formats": formats, "offsets": places, "itemsize": step})
     table = np.frombuffer(data[: count * step].tobytes(), layout)
     points = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
     return points[np.isfinite(points).all(axis=1)]

@@ -11,8 +11,8 @@ import torch
 
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.snippets import SnippetDraws, split_recordings
+from erfsfm.data.window import HEIGHTS
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.labels.structure import HEIGHTS
 from erfsfm.model_record import find_weights, read_record
 from erfsfm.training.run import train
 from erfsfm.training.supervision import imitated

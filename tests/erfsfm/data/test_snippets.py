@@ -20,7 +20,7 @@ from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
-from erfsfm.labels.structure import snippet_motion
+from erfsfm.data.window import snippet_motion
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet

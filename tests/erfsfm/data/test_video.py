@@ -13,10 +13,9 @@ import pytest
 
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data import many_view_teacher
-from erfsfm.data import video as module
+from erfsfm.data import recordings as module
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.data.recordings import Recording
-from erfsfm.data.video import Video
+from erfsfm.data.recordings import Recording, Video
 from erfsfm.geometry.camera import Camera
 
 FRAMES, SIZE = 40, (48, 32)

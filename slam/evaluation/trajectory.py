@@ -13,18 +13,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
 from slam.evaluation.drift import KITTI_LENGTHS_M, SegmentErrors, relative_errors, segment_errors
-from slam.formats.trajectory import (
-    Trajectory,
-    associate,
-    matching_tolerance_s,
-    read_trajectory,
-)
+from slam.formats.trajectory import Trajectory, associate, matching_tolerance_s, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import ConfigError, Failed, TrajectoryError
@@ -151,9 +146,6 @@ def trajectory_metrics(
         estimate: the trajectory to evaluate.
         reference: the truth of the same frames, row k beside row k (see `slam.formats.trajectory.associate`).
         snippet5: the paper's protocol where it was measured directly; by default cut from the estimate.
-
-    Raises:
-        TrajectoryError: if the two have different lengths.
     """
     reason = _why_not(estimate, reference)
     if reference is None or reason:
@@ -162,12 +154,14 @@ def trajectory_metrics(
         return TrajectoryMetrics(snippet5=snippets, align=aligned, evo=EvoMetrics.unknown(reason))
     T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
     ours = {name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS}
-    snippet5, is_cut = snippet5 or _cut_snippets(T_world_estimate, T_world_reference), snippet5 is None
+    snippets = [snippets_from_trajectory(T, SNIPPET_LENGTH) for T in (T_world_estimate, T_world_reference)]
     without_ate = None
-    if snippet5 and _stands_still(T_world_reference):
+    if _stands_still(T_world_reference):
         without_ate = _REFERENCE_STANDS_STILL
-    elif snippet5 and is_cut and _goes_backwards(T_world_estimate, T_world_reference):
+    elif snippet5 is None and _goes_backwards(*snippets):
         without_ate = _BACKWARDS
+    if snippet5 is None and len(snippets[0]):
+        snippet5 = snippet_errors(*snippets)
     return TrajectoryMetrics(
         snippet5=_snippet_metrics(snippet5, without_ate),
         align=Alignments.of(**ours),
@@ -201,9 +195,6 @@ def evo_commands(estimate: Path | str, reference: Path | str, format: str = "aut
     """The evo commands that give the numbers of ``evo`` for two files.
 
     None for files of two formats, with bad rows, or with stamps so different that poses are interpolated.
-
-    Raises:
-        TrajectoryError: if a file cannot be read in this format.
     """
     a, b = read_trajectory(estimate, format), read_trajectory(reference, format)
     if a.timed != b.timed or a.rows or b.rows:
@@ -225,9 +216,6 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
         metrics: the object T.
         limits: ``METRIC=VALUE`` each; METRIC is a path as ``align.7dof.ate_rmse_m`` or ``snippet5.ate_mean``,
             and a bare name such as ``ate_rmse_m`` means the one under ``7dof``.
-
-    Raises:
-        ConfigError: if a limit is malformed or there is no such metric.
     """
     lines, names = [], AlignedMetrics.names()
     for limit in limits:
@@ -286,28 +274,19 @@ def _alignment_metrics(
     return AlignedMetrics.of(**{name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()})
 
 
-def _cut_snippets(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> SnippetErrors | None:
-    """The paper's protocol on consecutive rows; None where they do not fill a snippet."""
-    if len(T_world_estimate) < SNIPPET_LENGTH:
-        return None
-    predicted = snippets_from_trajectory(T_world_estimate, SNIPPET_LENGTH)
-    return snippet_errors(predicted, snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH))
-
-
-def _goes_backwards(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> bool:
+def _goes_backwards(predicted: FloatArray, truth: FloatArray) -> bool:
     """Whether snippets point against the true ones, which a negative scale would take for a good fit."""
-    trajectories = T_world_estimate, T_world_reference
-    p, g = (snippets_from_trajectory(T, SNIPPET_LENGTH)[..., :3, 3] for T in trajectories)
+    p, g = predicted[..., :3, 3], truth[..., :3, 3]
     return bool((g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()))
 
 
 def _snippet_metrics(errors: SnippetErrors | None, without_ate: Failed | None = None) -> SnippetMetrics:
     if errors is None:
         few = Failed(f"a snippet needs {SNIPPET_LENGTH} frames")
-        found: dict[str, Any] = dict.fromkeys(("ate_mean", "ate_std", "re_mean", "re_std"), few) | {"count": 0}
-    else:
-        found = asdict(errors) | dict.fromkeys(("ate_mean", "ate_std") if without_ate else (), without_ate)
-    return SnippetMetrics.of(**found)
+        return SnippetMetrics.of(ate_mean=few, ate_std=few, re_mean=few, re_std=few, count=0)
+    return SnippetMetrics.of(
+        **asdict(errors) | ({"ate_mean": without_ate, "ate_std": without_ate} if without_ate else {})
+    )
 
 
 def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ours: AlignedMetrics) -> EvoMetrics:

@@ -52,8 +52,7 @@ class Ply:
 def read_ply(path: Path) -> Ply:
     """Read a whole file: every vertex, every triangle, and nothing after them.
 
-    Raises:
-        RunError: it is no PLY in little-endian form, is cut short, or holds impossible values.
+    ``RunError``: it is no PLY in little-endian form, is cut short, or holds impossible values.
     """
     parts = _mapped(path)
     vertices, faces = parts["vertex"], parts.get("face")

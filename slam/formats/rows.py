@@ -54,10 +54,8 @@ class BadRows:
     ) -> NDArray[np.intp]:
         """The rows in the order of their stamps ``(N,)``, without repeated ones and those far from their place.
 
-        A row a few places late is sorted in, and so are all rows of a table in no order at all. Bad rows are said.
-
-        Raises:
-            SlamError: more than a quarter of the rows would be left out, or none is ``wanted`` (`say`).
+        A row a few places late is sorted in, and so are all rows of a table in no order at all. Bad rows are said. A
+        file of which more than a quarter would be left out is refused, and so is one without a ``wanted`` row (`say`).
         """
         order = np.argsort(stamps, kind="stable")
         has_no_order = len(order) > 1 and np.mean(np.diff(stamps) < 0) > 1 - _LEAST_IN_ORDER
@@ -77,15 +75,7 @@ class BadRows:
         return good
 
     def say(self, left: int, wanted: str) -> None:
-        """Warn of the rows left out.
-
-        Args:
-            left: number of good rows.
-            wanted: what a row should hold.
-
-        Raises:
-            SlamError: none is left.
-        """
+        """Warn of the rows left out; refuse the file where none of those ``wanted`` is ``left``."""
         line, reason = min(self._reasons.items(), default=(0, ""))
         if not left:
             where = f", line {line}: {reason}" if reason else ": there is no row in this file"
@@ -98,11 +88,7 @@ class BadRows:
 
 
 def text_of(path: Path, error: type[SlamError], wanted: str) -> str:
-    """The text of a file that should hold what is ``wanted``.
-
-    Raises:
-        SlamError: the ``error``: it cannot be read.
-    """
+    """The text of a file that should hold what is ``wanted``; the ``error`` where it cannot be read."""
     try:
         return read_text(path)
     except FileNotFoundError as cause:

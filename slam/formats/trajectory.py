@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -56,11 +55,7 @@ class Trajectory:
     rows: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse shapes that do not fit, and stamps that are no times.
-
-        Raises:
-            ValueError: if there is no pose, the shapes are not ``(N,)`` and ``(N, 4, 4)``, or stamps do not increase.
-        """
+        """Refuse shapes that do not fit, and stamps that are no times."""
         count = len(self.T_world_camera)
         if not count or self.stamps.shape != (count,) or self.T_world_camera.shape != (count, 4, 4):
             raise ValueError(
@@ -117,9 +112,6 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     the columns of all. Stamps are seconds, or whole milli-, micro- or nanoseconds. A header, blank lines and those that
     start with ``#`` are skipped; bad rows are left out (`slam.formats.rows`), and where rows have no stamps the others
     keep their numbers. Rotations that are not orthonormal by rounding are replaced by the nearest rotation.
-
-    Raises:
-        TrajectoryError: if the file cannot be read as such; the message names file and line.
     """
     path = Path(path)
     if format not in ("auto", *_COLUMNS):
@@ -159,8 +151,8 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
     """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically; after its number where it has one."""
     rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
-    numbers = (f"{stamp:.0f} " if trajectory.numbered else "" for stamp in trajectory.stamps)
-    _write(Path(path), (number + _row(row) for number, row in zip(numbers, rows)))
+    numbers = [f"{stamp:.0f} " if trajectory.numbered else "" for stamp in trajectory.stamps]
+    _write(path, [number + _row(row) for number, row in zip(numbers, rows)])
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
@@ -168,8 +160,8 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
     poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
     stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
-    rows = (f"{stamp} {_row(pose)}" for stamp, pose in zip(stamps, poses))
-    _write(Path(path), ["# timestamp tx ty tz qx qy qz qw", *rows])
+    rows = [f"{stamp} {_row(pose)}" for stamp, pose in zip(stamps, poses)]
+    _write(path, ["# timestamp tx ty tz qx qy qz qw", *rows])
 
 
 def associate(
@@ -181,13 +173,8 @@ def associate(
     differ, the denser trajectory is interpolated at those of the other. Otherwise rows are matched by their frame
     numbers where one of the two has them, and else row k belongs to row k.
 
-    Args:
-        estimate: to be compared.
-        reference: the truth.
-        frames: only these rows [start, stop) of the reference; an estimate of as many rows is of these frames.
-
-    Raises:
-        TrajectoryError: if the lengths differ and stamps or frame numbers are missing, or none match.
+    Of ``frames`` only these rows [start, stop) of the reference count; an estimate of as many rows is of these frames.
+    ``TrajectoryError``: the lengths differ and stamps or frame numbers are missing, or none match.
     """
     if not (estimate.timed and reference.timed):
         if frames is not None:
@@ -195,14 +182,15 @@ def associate(
         return _same_frames(estimate, reference)
     if frames is not None:
         reference = reference.select(np.arange(*frames))
-    # Slack, because the tolerance itself is a difference of rounded stamps.
-    within_s = matching_tolerance_s(estimate, reference) * (1.0 + 1e-6)
+    tolerance_s = matching_tolerance_s(estimate, reference)
+    # slack, because the tolerance itself is a difference of rounded stamps
+    within_s = tolerance_s * (1.0 + 1e-6)
     rows_estimate, rows_reference = nearest_pairs(estimate.stamps, reference.stamps, within_s)
     cure = other_unit(estimate.stamps, reference.stamps)
     if not rows_estimate.size or (cure and len(rows_estimate) < _LEAST_OF_OTHER_UNIT):
+        ours, theirs = (f"{each.stamps[0]:.3f} to {each.stamps[-1]:.3f} s" for each in (estimate, reference))
         raise TrajectoryError(
-            f"no time stamps match within {matching_tolerance_s(estimate, reference):.3g} s: the estimate "
-            f"covers {_time_span(estimate)} and the reference {_time_span(reference)}; "
+            f"no time stamps match within {tolerance_s:.3g} s: the estimate covers {ours} and the reference {theirs}; "
             f"{cure or 'bring both to the same clock'}"
         )
     expected = min(len(estimate), len(reference))
@@ -283,10 +271,6 @@ def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.int
     return nearest
 
 
-def _time_span(trajectory: Trajectory) -> str:
-    return f"{trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
-
-
 def _read_numbers(
     path: Path, forms: tuple[int, ...], bad: BadRows
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
@@ -298,17 +282,16 @@ def _read_numbers(
     columns = max(forms, key=lambda form: counts[form])
     lines, rows, numbers = [], [], []
     for row, (line, words) in enumerate(table):
+        odd = next((word for word in words if not is_number(word)), None)
         if len(words) != columns:
             bad.add(line, _other_columns(len(words), columns if counts[columns] else forms[0], forms))
-            continue
-        odd = next((word for word in words if not is_number(word)), None)
-        if odd is not None:
+        elif odd is not None:
             hint = "; decimals are written with a point" if is_number(odd.replace(",", ".")) else ""
             bad.add(line, f"not a number: {odd!r}{hint}")
-            continue
-        numbers.append([float(word) for word in words])
-        lines.append(line)
-        rows.append(row)
+        else:
+            numbers.append([float(word) for word in words])
+            lines.append(line)
+            rows.append(row)
     return np.array(lines, np.intp), np.array(rows, np.intp), np.array(numbers).reshape(-1, columns)
 
 
@@ -321,9 +304,8 @@ def _words(line: str) -> list[str]:
     if len(words) < _COLUMNS["tum"][0]:
         return words
     stamp = in_seconds(words[0])
-    if separators and stamp != words[0]:
-        return [stamp, *words[1:4], *words[5:8], words[4]]
-    return [stamp, *words[1:]]
+    is_euroc = separators and stamp != words[0]
+    return [stamp, *words[1:4], *words[5:8], words[4]] if is_euroc else [stamp, *words[1:]]
 
 
 def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:
@@ -333,10 +315,10 @@ def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:
     return f"{count} columns where {'KITTI' if wanted in _COLUMNS['kitti'] else 'TUM'} has {wanted}{other}"
 
 
-def _row(values: Iterable[float]) -> str:
+def _row(values: FloatArray) -> str:
     return " ".join(f"{value:.9e}" for value in values)
 
 
-def _write(path: Path, rows: Iterable[str]) -> None:
-    text = "".join(f"{row}\n" for row in rows)
-    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), TrajectoryError)
+def _write(path: Path | str, rows: list[str]) -> None:
+    text = "\n".join([*rows, ""])
+    write_atomically(Path(path), lambda partial: partial.write_text(text, encoding="utf-8"), TrajectoryError)

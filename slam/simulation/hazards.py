@@ -108,7 +108,9 @@ class Traffic:
     def placed(self, index: int) -> list[Mesh]:
         """The cars within sight at a frame, in the street frame."""
         camera = self._route.T_street_camera[index, :3, 3]
-        T_street_cars = [self._leader(index)]
+        # the one in the camera's lane keeps its distance, until it drives away
+        faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
+        T_street_cars = [self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)]
         T_street_cars += [self._at(start + speed * index, left_m, -1.0) for start, speed, left_m in self._starts]
         T_street_cars += [self._at(start + speed * index, left_m, 1.0) for start, speed, left_m in self._passing]
         near = {}
@@ -119,11 +121,6 @@ class Traffic:
             if 2.6 < distance < 120.0:  # nearer only where the drive crosses itself
                 near[number] = T_street_car
         return self._cars.placed(near)
-
-    def _leader(self, index: int) -> FloatArray | None:
-        """A car in the camera's lane that keeps its distance, until it drives away."""
-        faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
-        return self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""

@@ -65,13 +65,12 @@ class _Furnisher:
         east, north, up = np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0]), np.array([0, 0, DOOR_HEIGHT])
         corner = np.array([x0, y0, 0.0])
         if x1 - x0 > WALL + 0.01:
-            self.soup.quad(corner, north, up, self.frame_look)
-            self.soup.quad(corner + east + north, -north, up, self.frame_look)
+            jambs = (corner, north), (corner + east + north, -north)
         else:
-            self.soup.quad(corner + east, -east, up, self.frame_look)
-            self.soup.quad(corner + north, east, up, self.frame_look)
-        self.soup.quad(corner + up, north, east, self.frame_look)
-        self.soup.quad(corner, east, north, self.frame_look)
+            jambs = (corner + east, -east), (corner + north, east)
+        lintel, threshold = (corner + up, north, east), (corner, east, north)
+        for quad in (*((foot, along, up) for foot, along in jambs), lintel, threshold):
+            self.soup.quad(*quad, self.frame_look)
 
     def _floor(self, room: Room) -> int:
         rng = self.rng
@@ -169,10 +168,9 @@ class _Furnisher:
             sky = np.array([0.86, 0.92, 0.98]) * float(rng.uniform(0.9, 1.05))
             pane = self.soup.instance(Material.PANE, sky, self.skirting, (width, high, 1.0))
             furniture.plate(self.soup, frame, (left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
-            middle = frame[3] + (left + 0.5 * width) * frame[0] + 0.8 * frame[1]
-            self.lights.append(
-                (middle[0], middle[1], low + 0.6 * high, (0.35 if room.kind == "hall" else 0.7) * width * high)
-            )
+            x_light, y_light, _ = frame[3] + (left + 0.5 * width) * frame[0] + 0.8 * frame[1]
+            strength = (0.35 if room.kind == "hall" else 0.7) * width * high
+            self.lights.append((x_light, y_light, low + 0.6 * high, strength))
             spans.append((left, left + width))
             left += width + float(rng.uniform(0.5, 2.5))
         return spans
@@ -211,8 +209,6 @@ class _Furnisher:
         across, along = (max(1, round((extent) / 3.4)) for extent in (x1 - x0, y1 - y0))
         for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
             for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
-                size = (0.5, 0.3, 0.05)
-                furniture.solid(
-                    self.soup, frame_at(x - 0.25, y - 0.15, 0.0, room.height - 0.06), (0, 0, 0.001), size, bulb
-                )
+                frame = frame_at(x - 0.25, y - 0.15, 0.0, room.height - 0.06)
+                furniture.solid(self.soup, frame, (0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
                 self.lights.append((float(x), float(y), room.height - 0.3, strength))

@@ -22,11 +22,7 @@ from slam.simulation.world import SimulatedWorld
 
 
 def simulated_world(options: SimulationOptions) -> SimulatedWorld:
-    """The street or the rooms of these options.
-
-    Raises:
-        SequenceError: there are too few frames for the route.
-    """
+    """The street or the rooms of these options; ``SequenceError`` where there are too few frames for the route."""
     return SimulatedRooms(options) if options.route == "rooms" else SimulatedStreet(options)
 
 
@@ -47,9 +43,6 @@ def write_kitti_root(
         lidar: whether to write scans.
         progress: called with the number of frames written so far.
         mesh: whether to write all surfaces that stand still, as ``mesh.ply`` in the frame of the first camera.
-
-    Raises:
-        SequenceError: if ``output`` holds something already, or cannot be written; scans of a world without a LiDAR.
     """
     if lidar and world.T_camera_lidar is None:
         raise SequenceError(f"no LiDAR is carried through {world.options.route}: leave --lidar out")
@@ -74,15 +67,10 @@ def write_kitti_root(
 
 
 def _write_frames(
-    world: SimulatedWorld,
-    folder: Path,
-    depth: bool,
-    lidar: bool,
-    progress: Callable[[int], None] | None,
+    world: SimulatedWorld, folder: Path, depth: bool, lidar: bool, progress: Callable[[int], None] | None
 ) -> None:
     """Images, and depth maps and scans if wanted."""
-    wanted = {"image_2": True, "depth_2": depth, "velodyne": lidar}
-    for name in (name for name, is_wanted in wanted.items() if is_wanted):
+    for name in ["image_2"] + ["depth_2"] * depth + ["velodyne"] * lidar:
         (folder / name).mkdir(parents=True)
     for index in range(len(world)):
         frame = world.render(index)

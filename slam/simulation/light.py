@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.simulation.geometry import Float32Array, Mesh
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.simulation.surface import Hits, unlit
 from slam.simulation.texture import Texels, fractal
 
@@ -25,14 +25,20 @@ class Weather:
     contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
 
 
+def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatArray:
+    """Its direction at an elevation in radians, ``(3,)``."""
+    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lowest, highest)
+    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.array(sun)
+
+
 def draw_weather(seed: int) -> Weather:
     """Weather of a world."""
     rng = np.random.default_rng([seed, 20])
-    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.5, 1.1)
-    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    sun = _draw_sun(rng, 0.5, 1.1)
     sunshine = float(rng.uniform(0.25, 0.75))
     return Weather(
-        sun=np.array(sun, dtype=np.float32),
+        sun=sun.astype(np.float32),
         sunshine=sunshine,
         ambient=0.95 - 0.6 * sunshine,
         zenith=(np.array([0.38, 0.56, 0.85]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
@@ -46,15 +52,14 @@ def draw_weather(seed: int) -> Weather:
 def draw_varied_weather(seed: int) -> Weather:
     """Weather of a varied world: three in four have a sun beside which shadows are 3 to 10 times as dark."""
     rng = np.random.default_rng([seed, 21])
-    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.3, 1.15)
-    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    sun = _draw_sun(rng, 0.3, 1.15)
     sunny = rng.random() < 0.75
     ambient = 1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0)))) if sunny else float(rng.uniform(0.6, 0.95))
     bright = float(rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4))
     blue = np.array([0.30, 0.52, 0.85]) + rng.uniform(-0.08, 0.08, 3)
     return Weather(
-        sun=np.array(sun, dtype=np.float32),
-        sunshine=(1.0 - ambient) / np.sin(elevation),  # a level road has 1 in the sun
+        sun=sun.astype(np.float32),
+        sunshine=(1.0 - ambient) / sun[2],  # a level road has 1 in the sun
         ambient=ambient,
         zenith=(bright * blue).astype(np.float32),
         horizon=(bright * (np.array([0.80, 0.86, 0.92]) + rng.uniform(-0.08, 0.08, 3))).astype(np.float32),

@@ -126,9 +126,8 @@ def ball(soup: Soup, rng: np.random.Generator, centre: FloatArray, radii: FloatA
     """A lumpy ellipsoid of 6 x 9 faces."""
     polar, around = np.linspace(0.0, np.pi, 7), np.linspace(0.0, 2.0 * np.pi, 10)
     sin_polar = np.sin(polar)[:, None]
-    unit = np.stack(
-        [sin_polar * np.cos(around), sin_polar * np.sin(around), np.cos(polar)[:, None] * np.ones(10)], axis=2
-    )
+    up = np.cos(polar)[:, None] * np.ones(10)
+    unit = np.stack([sin_polar * np.cos(around), sin_polar * np.sin(around), up], axis=2)
     lump = rng.uniform(0.75, 1.2, (7, 10, 1))
     lump[:, -1], lump[0], lump[-1] = lump[:, 0], 1.0, 1.0
     points = centre + unit * lump * radii
@@ -177,9 +176,8 @@ def sign(soup: Soup, rng: np.random.Generator, x: float, y: float, facing: float
 
 def railing(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float) -> None:
     """Posts and bars along the frame's x axis, which one sees through."""
-    steel = soup.instance(
-        Material.METAL, colour(rng, (0.55, 0.56, 0.57), (0.18, 0.20, 0.20), (0.72, 0.72, 0.70), (0.42, 0.30, 0.20))
-    )
+    tone = colour(rng, (0.55, 0.56, 0.57), (0.18, 0.20, 0.20), (0.72, 0.72, 0.70), (0.42, 0.30, 0.20))
+    steel = soup.instance(Material.METAL, tone)
     height, spacing = float(rng.uniform(0.6, 1.3)), float(rng.choice([0.15, 0.3, 1.5, 2.5]))
     radius = float(rng.uniform(0.015, 0.05))
     posts = np.arange(0.0, length, max(spacing, length / 120))

@@ -41,11 +41,7 @@ class SimulationOptions:
     fov_deg: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse invalid options.
-
-        Raises:
-            SequenceError: naming the option.
-        """
+        """Refuse invalid options by a ``SequenceError`` that names one."""
         if self.route not in WORLD_KINDS:
             raise SequenceError(f"route must be one of {', '.join(WORLD_KINDS)}; got {self.route!r}")
         place, known = ("rooms", get_args(RoomHazard)) if self.route == "rooms" else ("a street", get_args(Hazard))

@@ -35,11 +35,7 @@ class SimulatedRooms(SimulatedWorld):
     """A house and a walk through it; the attributes are those of `SimulatedWorld`."""
 
     def __init__(self, options: SimulationOptions) -> None:
-        """Plan the house and the walk.
-
-        Raises:
-            SequenceError: if there are too few frames.
-        """
+        """Plan the house and the walk; ``SequenceError`` where there are too few frames."""
         if options.frames < 2:
             raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
         house, self._interior = _furnished_house(options.seed)

@@ -9,14 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Bend, FloatArray, road_bend, town_bend
-from slam.simulation.streets import (
-    SMALLEST_BLOCK,
-    StreetPlan,
-    grid_walk,
-    loop_cycle,
-    road_plan,
-    town_plan,
-)
+from slam.simulation.streets import SMALLEST_BLOCK, StreetPlan, grid_walk, loop_cycle, road_plan, town_plan
 from slam.simulation.variety import StreetKind, Variety
 
 RouteKind = Literal["loop", "grid", "straight"]
@@ -49,9 +42,6 @@ def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variet
 
     A ``loop`` drives its start again, a ``grid`` repeats streets in both directions (with about 250 frames), and
     ``straight`` never comes back. Without a ``variety`` it is a town, and a camera like KITTI's.
-
-    Raises:
-        SequenceError: if there are too few frames for the route.
     """
     moving = frames - still_frames
     if moving < 2:
@@ -137,10 +127,8 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     for node, before, after, turn in zip(nodes[1:-1], right[:-1], right[1:], turns):
         corners.append(node + offset * (before + after if abs(turn) > 0.5 else after))
     corners.append(nodes[-1] + offset * right[-1])
-    points = [corners[0]]
-    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:]):
-        points.extend(_corner(rng, before, corner, after))
-    path = _resample(np.stack([*points, corners[-1]]))
+    rounded = [point for three in zip(corners[:-2], corners[1:-1], corners[2:]) for point in _corner(rng, *three)]
+    path = _resample(np.stack([corners[0], *rounded, corners[-1]]))
     path = gaussian_filter1d(path, 1.6 / STEP, axis=0, mode="nearest")
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -195,7 +183,7 @@ def _poses(
     bend: Bend,
     lane_plan: FloatArray,
     sample: FloatArray,
-    camera_height_m: float,
+    height_m: float,
     variety: Variety | None,
 ) -> FloatArray:
     """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, with suspension.
@@ -221,7 +209,7 @@ def _poses(
         suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
     else:
         suspension[:, [0, 2]] += -variety.pitch, variety.roll
-    position = bend(at) - (camera_height_m + suspension[:, 3:]) * down
+    position = bend(at) - (height_m + suspension[:, 3:]) * down
     T_street_level = se3.make(np.stack([right, down, forward], axis=2), position)
     return T_street_level @ se3.from_rotation_vector(suspension[:, :3], np.zeros((len(at), 3)))
 

@@ -2,25 +2,17 @@
 
 import numpy as np
 
+from slam.frames import Intrinsics
 from slam.simulation.geometry import Float32Array, FloatArray
 
-# KITTI odometry 00-02 (rectified colour camera), the size it was recorded at
-_KITTI_SIZE = (1241, 376)
-_KITTI_FOCAL_PX = 718.856
-_KITTI_CENTRE_PX = (607.1928, 185.2157)
-
-
-def kitti_intrinsics(width: int, height: int) -> FloatArray:
-    """KITTI's camera matrix for a resized image, half-pixel exact, ``(3, 3)``."""
-    sx, sy = width / _KITTI_SIZE[0], height / _KITTI_SIZE[1]
-    cx, cy = (_KITTI_CENTRE_PX[0] + 0.5) * sx - 0.5, (_KITTI_CENTRE_PX[1] + 0.5) * sy - 0.5
-    return np.array([[_KITTI_FOCAL_PX * sx, 0.0, cx], [0.0, _KITTI_FOCAL_PX * sy, cy], [0.0, 0.0, 1.0]])
+# KITTI odometry 00-02 (rectified colour camera), at the size it was recorded at
+KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 
 
 def square_intrinsics(width: int, height: int, fov_deg: float) -> FloatArray:
     """Camera matrix ``(3, 3)`` of square pixels with a horizontal field of view, its centre in the middle."""
     focal_px = 0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg))
-    return np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+    return Intrinsics(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1)).K
 
 
 def pixel_rays(K: FloatArray, width: int, height: int) -> Float32Array:

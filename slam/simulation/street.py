@@ -17,7 +17,7 @@ from slam.simulation.light import draw_varied_weather, draw_weather, paint, sky
 from slam.simulation.objects import bonnet
 from slam.simulation.options import SimulationOptions
 from slam.simulation.route import plan_route
-from slam.simulation.sensors import T_CAMERA_LIDAR, beam_directions, kitti_intrinsics, measured, square_intrinsics
+from slam.simulation.sensors import KITTI_CAMERA, T_CAMERA_LIDAR, beam_directions, measured, square_intrinsics
 from slam.simulation.surface import Hits, Surface, place_rays
 from slam.simulation.town import build_town
 from slam.simulation.variety import draw_variety
@@ -33,18 +33,13 @@ class SimulatedStreet(SimulatedWorld):
     T_camera_lidar: FloatArray
 
     def __init__(self, options: SimulationOptions) -> None:
-        """Plan the drive.
-
-        Raises:
-            SequenceError: if there are too few frames for the route.
-        """
-        K = kitti_intrinsics(options.width, options.height)
+        """Plan the drive; ``SequenceError`` where there are too few frames for the route."""
+        size = options.width, options.height
         still = effects.STILL_FRAMES if "stop" in options.hazards else 0
         variety = draw_variety(options.seed, options.route == "straight") if options.varied else None
-        if variety is not None:
-            K = variety.intrinsics(options.width, options.height)
+        K = KITTI_CAMERA.resized(*size).K if variety is None else variety.intrinsics(*size)
         if options.fov_deg is not None:
-            K = square_intrinsics(options.width, options.height, options.fov_deg)
+            K = square_intrinsics(*size, options.fov_deg)
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, K, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
@@ -108,13 +103,6 @@ class SimulatedStreet(SimulatedWorld):
     def _shade(
         self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
     ) -> Float32Array:
-        lit = self._sunlit(surfaces, rays, hits, pixels)
-        return paint(surfaces[number].mesh, hits, lit, self._weather, float(self.K[0, 0]))
-
-    def _sunlit(
-        self, surfaces: list[Surface], rays: Float32Array, hits: Hits, pixels: NDArray[np.int64]
-    ) -> Float32Array:
-        """Visibility of the sun from each hit, smoothed over neighbouring pixels, ``(N,)``."""
         towards = np.flatnonzero(self._weather.sun @ hits.normals > 0.0)
         to_sun = np.take(rays, towards, axis=0)
         to_sun[:, :3] += to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
@@ -123,8 +111,9 @@ class SimulatedStreet(SimulatedWorld):
         shadow = np.any([surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0)
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
         lit[pixels[towards]] = 1.0 - shadow
-        soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))
-        return np.asarray(np.take(soft, pixels), dtype=np.float32)
+        soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))  # over neighbouring pixels
+        lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
+        return paint(surfaces[number].mesh, hits, lit, self._weather, float(self.K[0, 0]))
 
     def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
         """Rain, lens blur, exposure, and quantisation to 8 bits."""

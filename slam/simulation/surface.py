@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
 from slam.simulation.sensors import footprint
-from slam.simulation.texture import Texels, shade
+from slam.simulation.texture import SHADERS, Texels
 
 
 @dataclass(frozen=True)
@@ -95,5 +95,5 @@ def unlit(mesh: Mesh, hits: Hits, focal_px: float) -> Float32Array:
         texels = Texels(u[part], v[part], u_size[part], v_size[part], offsets[0, part], offsets[1, part])
         colours = np.take(mesh.colours, instance[part], axis=2)
         parameters = np.take(mesh.parameters, instance[part], axis=1)
-        rgb[:, part] = shade(Material(kind), texels, colours, parameters)
+        rgb[:, part] = SHADERS[Material(kind)](texels, colours, parameters)
     return rgb

@@ -102,6 +102,10 @@ GLOWING = {Material.SCREEN: 1.3, Material.PANE: 2.2, Material.LAMP: 2.5}  # ligh
 _INK = np.array([[0.12], [0.12], [0.14]], dtype=np.float32)
 
 
+# unlit RGB (3, N), about [0, 1], of texels by the two colours (2, 3, N) and the parameters (PARAMETERS, N) of instances
+Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
+
+
 def _size(texels: Texels) -> Float32Array:
     return np.maximum(texels.u_size, texels.v_size)
 
@@ -178,9 +182,8 @@ def _books(texels: Texels, colours: Float32Array, parameters: Float32Array) -> F
     cell = texels.u / 0.045 + 0.3 * cell_hash(shelf, shelf + texels.shift, 3)
     spine = np.floor(cell + 0.35 * cell_hash(cell, shelf + texels.shift, 5))
     luck = [cell_hash(spine + texels.shift, shelf + texels.shift_v, salt) for salt in (11, 12, 13)]
-    tall = (
-        row * (0.55 + 0.33 * luck[0]) * (cell_hash((spine / 7.0 + texels.shift).astype(np.float32), shelf, 14) > 0.15)
-    )
+    filled = cell_hash((spine / 7.0 + texels.shift).astype(np.float32), shelf, 14) > 0.15
+    tall = row * (0.55 + 0.33 * luck[0]) * filled
     near = np.clip(0.045 / texels.u_size - 0.4, 0.0, 1.0)
     spines = 0.1 + 0.55 * (0.5 * np.stack(luck) + 0.5 * luck[0]).astype(np.float32) * (0.5 + 0.5 * luck[1])
     title = band(v, texels.v_size, 0.6 * tall, 0.75 * tall) * (luck[2] > 0.5)
@@ -193,8 +196,7 @@ def _books(texels: Texels, colours: Float32Array, parameters: Float32Array) -> F
 def _picture(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     """A painting of blots, or a poster of a picture and text, in a frame."""
     width, height, kind = parameters[:3]
-    scale = np.float32(1.0)
-    blot = fractal(texels, (0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.4)) * scale
+    blot = fractal(texels, (0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.4))
     first, second = np.clip(9.0 * blot + 0.5, 0.0, 1.0), np.clip(9.0 * np.abs(blot - 0.3) - 1.2, 0.0, 1.0)
     third = np.stack([colours[1][2], colours[0][0], colours[1][0]])
     rgb = mix(mix(third, colours[0], second), colours[1], first)
@@ -233,15 +235,6 @@ def _carton(texels: Texels, colours: Float32Array, parameters: Float32Array) -> 
     return rgb * (1.0 - 0.35 * _rim(texels, width, height, 0.008))
 
 
-Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
-
-
-def shade(material: Material, texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    """Unlit RGB ``(3, N)``, about [0, 1], of texels of one material, by the two colours ``(2, 3, N)`` and the
-    parameters ``(PARAMETERS, N)`` of their instances."""
-    return _SHADERS[material](texels, colours, parameters)
-
-
 def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     rgb = _junction(texels, colours, parameters)
     half, dash, fraction = parameters[0, 0], parameters[1, 0], parameters[2, 0]
@@ -271,11 +264,9 @@ def _junction(texels: Texels, colours: Float32Array, parameters: Float32Array) -
 
 
 def _pavement(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    slab = parameters[0, 0]
-    joints = np.maximum(
-        stripes(texels.u, texels.u_size, float(slab), 0.035), stripes(texels.v, texels.v_size, float(slab), 0.035)
-    )
-    near = np.clip(slab / np.maximum(texels.u_size, texels.v_size) / 2.0 - 0.5, 0.0, 1.0)
+    slab = float(parameters[0, 0])
+    joints = np.maximum(stripes(texels.u, texels.u_size, slab, 0.035), stripes(texels.v, texels.v_size, slab, 0.035))
+    near = np.clip(slab / _size(texels) / 2.0 - 0.5, 0.0, 1.0)
     tone = (cell_hash(texels.u / slab, texels.v / slab, 1) - 0.5) * near * 0.3
     grain = fractal(texels, (4.0, 4.0, 0.2), (1.0, 1.0, 0.16), (0.25, 0.25, 0.2), (0.08, 0.08, 0.12))
     return mix(colours[0] * (1.0 + grain + tone), 0.6 * colours[1], joints)
@@ -367,7 +358,7 @@ def _roof(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
 
 def _sign(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     half, kind = parameters[0], parameters[1]
-    x, y, size = texels.u - half, texels.v - half, np.maximum(texels.u_size, texels.v_size)
+    x, y, size = texels.u - half, texels.v - half, _size(texels)
     edge = np.where(kind == 0, np.hypot(x, y), np.maximum(np.abs(x), np.abs(y))) / half
     rim = np.clip((edge - 0.72) * half / size + 0.5, 0.0, 1.0)
     bar = band(y, texels.v_size, -0.14 * half, 0.16 * half) * band(np.abs(x), texels.u_size, -1.0, 0.5 * half)
@@ -390,9 +381,7 @@ def _glass(texels: Texels, colours: Float32Array, parameters: Float32Array) -> F
 
 
 def _tyre(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    radius = np.hypot(texels.u, texels.v)
-    size = np.maximum(texels.u_size, texels.v_size)
-    return mix(colours[0], colours[1], band(radius, size, -1.0, 0.19))
+    return mix(colours[0], colours[1], band(np.hypot(texels.u, texels.v), _size(texels), -1.0, 0.19))
 
 
 def _fence(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
@@ -408,7 +397,7 @@ def _take(texels: Texels, chosen: NDArray[np.int64]) -> Texels:
     return Texels(*(getattr(texels, field.name)[chosen] for field in fields(Texels)))
 
 
-_SHADERS: dict[Material, Shader] = {
+SHADERS: dict[Material, Shader] = {
     Material.ASPHALT: _asphalt,
     Material.JUNCTION: _junction,
     Material.PAVEMENT: _pavement,

@@ -20,8 +20,9 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
     for i in range(len(plan.xs) - 1):
         for j in range(len(plan.ys) - 1):
             town.block(i, j)
-    if plan.kind == "motorway":
-        town.median()
+    if plan.kind == "motorway":  # a barrier between the carriageways
+        start, end = float(plan.xs[0]), float(plan.xs[-1])
+        objects.barrier(town.soup, rng, objects.frame_at(start, 0.0, 0.0), end - start, rng.random() < 0.5)
     town.backdrop()
     return town.soup.finish(bend)
 
@@ -112,40 +113,28 @@ class _Town:
         points = self._grid(rectangle, z, step)
         self.soup.patch(points, points[..., :2], instance)
 
-    def median(self) -> None:
-        """The barrier between the carriageways of a motorway."""
-        start, end = float(self.plan.xs[0]), float(self.plan.xs[-1])
-        objects.barrier(self.soup, self.rng, objects.frame_at(start, 0.0, 0.0), end - start, self.rng.random() < 0.5)
-
     def block(self, i: int, j: int) -> None:
         """One cell of the grid: pavement with kerbs around it, lots inside."""
         plan, half = self.plan, self.plan.half_width
         x0, x1 = float(plan.xs[i]) + half, float(plan.xs[i + 1]) - half
         y0, y1 = float(plan.ys[j]) + half, float(plan.ys[j + 1]) - half
-        sides = (  # south, east, north, west
-            plan.is_street((i, j), (i + 1, j)),
-            plan.is_street((i + 1, j), (i + 1, j + 1)),
-            plan.is_street((i, j + 1), (i + 1, j + 1)),
-            plan.is_street((i, j), (i, j + 1)),
-        )
+        nodes = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
+        sides = [plan.is_street(*edge) for edge in zip(nodes, nodes[1:] + nodes[:1])]  # south, east, north, west
         width = self.pavement_width
         inner = (x0 + width, y0 + width, x1 - width, y1 - width)
         self._pavement((x0, y0, x1, y1), inner, sides)
         if self.open:
-            self._field((x0, y0, x1, y1), inner, sides)
+            self._field(inner, sides)
             return
         self._slab(inner, KERB, self.grass if self.rng.random() < 0.7 else self.gravel)
-        corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
-        for side, street in enumerate(sides):
-            if street:
-                self._furnish(np.array(corners[side]), np.array(corners[(side + 1) % 4]))
+        corners = _corners((x0, y0, x1, y1))
+        for side in np.flatnonzero(sides):
+            self._furnish(corners[side], corners[(side + 1) % 4])
         self._split(inner, inner, sides)
 
-    def _pavement(self, outer: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
+    def _pavement(self, outer: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """A ring of paving between a rounded outline and the lots, and the kerb below its edge."""
-        x0, y0, x1, y1 = outer
-        rim: list[FloatArray] = []
-        corners = [np.array(c) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        rim, corners = [], _corners(outer)
         for k in range(4):
             here, after, before = corners[k], corners[(k + 1) % 4], corners[k - 1]
             radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
@@ -153,8 +142,7 @@ class _Town:
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
                 rim.append(here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead))
             reach = float(np.linalg.norm(after - here)) - ROUNDING - 1.0
-            for along in np.arange(ROUNDING + 2.0, reach, 2.5):
-                rim.append(here + along * ahead)
+            rim += [here + along * ahead for along in np.arange(ROUNDING + 2.0, reach, 2.5)]
         edge = np.stack([*rim, rim[0]])
         inside = np.clip(edge, [inner[0], inner[1]], [inner[2], inner[3]])
         ring = np.pad(np.stack([edge, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
@@ -208,7 +196,7 @@ class _Town:
             else:
                 objects.post(self.soup, rng, float(spot[0]), float(spot[1]))
 
-    def _field(self, outer: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
+    def _field(self, inner: Rectangle, sides: list[bool]) -> None:
         """Open land that may rise beside the road to a bank, with trees, bushes, hedges, fences or barriers."""
         rng, soup = self.rng, self.soup
         rise, run = max(0.0, float(rng.uniform(-3.0, 5.0))), float(rng.uniform(3.0, 10.0))
@@ -225,10 +213,10 @@ class _Town:
         land = self.grass if rng.random() < 0.4 else soup.instance(Material.GRASS, crop, 0.6 * crop)
         soup.patch(points, points[..., :2], land)
         wood = float(rng.choice([0.0, 1.0, 4.0, 10.0]))  # trees in 100 square metres near the road
-        corners = [np.array(corner) for corner in ((low[0], low[1]), (high[0], low[1]), high, (low[0], high[1]))]
-        for side in (side for side in range(4) if sides[side]):
-            start, end = corners[side], corners[(side + 1) % 4]
-            length, ahead, inward, angle = _directed(start, end)
+        corners = _corners(inner)
+        for side in np.flatnonzero(sides):
+            start = corners[side]
+            length, ahead, inward, angle = _directed(start, corners[(side + 1) % 4])
             frame = objects.frame_at(start[0], start[1], angle, KERB)
             for _ in range(int(rng.poisson(0.15 * wood * length))):
                 far = 15.0 * rng.random() ** 1.5
@@ -264,33 +252,26 @@ class _Town:
         elif kind < 0.75:
             objects.barrier(soup, rng, frame, length, False)
 
-    def _split(self, lot: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
+    def _split(self, lot: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """Cut a lot in two until each piece is of the size of a house."""
         x0, y0, x1, y1 = lot
         width, depth = x1 - x0, y1 - y0
         if max(width, depth) > 17.0:
             cut = float(self.rng.uniform(0.4, 0.6))
-            if width > depth:
-                middle = x0 + cut * width
-                parts: tuple[Rectangle, Rectangle] = ((x0, y0, middle, y1), (middle, y0, x1, y1))
-            else:
-                middle = y0 + cut * depth
-                parts = ((x0, y0, x1, middle), (x0, middle, x1, y1))
-            for part in parts:
-                self._split(part, inner, sides)
+            x, y = (x0 + cut * width, y1) if width > depth else (x1, y0 + cut * depth)
+            self._split((x0, y0, x, y), inner, sides)
+            self._split((x, y0, x1, y1) if width > depth else (x0, y, x1, y1), inner, sides)
             return
         touches = (y0 == inner[1], x1 == inner[2], y1 == inner[3], x0 == inner[0])
-        facing = [k for k in range(4) if touches[k] and sides[k]]
-        self._lot(lot, facing)
+        self._lot(lot, [k for k in range(4) if touches[k] and sides[k]])
 
     def _lot(self, lot: Rectangle, facing: list[int]) -> None:
         """Build on a lot, or leave it open; ``facing`` lists the sides at a street (south, east, north, west)."""
-        rng, (x0, y0, x1, y1) = self.rng, lot
+        rng, (x0, y0, x1, y1), corners = self.rng, lot, _corners(lot)
         if min(x1 - x0, y1 - y0) > 5.0 and rng.random() < (self.density if facing else 0.3):
             side = facing[0] if facing else 0
             front = float(rng.uniform(0.0, 3.0)) if facing else 1.0
             gap = float(rng.choice([0.02, rng.uniform(0.4, 1.6)]))
-            corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
             width, depth = (x1 - x0, y1 - y0) if side % 2 == 0 else (y1 - y0, x1 - x0)
             frame = objects.frame_at(*corners[side], side * np.pi / 2.0, self.foot)
             frame[3] += gap * frame[0] + front * frame[1]
@@ -301,7 +282,6 @@ class _Town:
                 objects.hedge(self.soup, rng, frame, 0.6 * width)
             return
         for side in facing:
-            corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
             if rng.random() < 0.6:
                 length = x1 - x0 if side % 2 == 0 else y1 - y0
                 frame = objects.frame_at(*corners[side], side * np.pi / 2.0, KERB - 0.05)
@@ -313,11 +293,9 @@ class _Town:
     def backdrop(self) -> None:
         """Trees and houses beyond the edge of town, so that no street ends in the sky."""
         rng, xs, ys = self.rng, self.plan.xs, self.plan.ys
-        x0, y0, x1, y1 = float(xs[0]), float(ys[0]), float(xs[-1]), float(ys[-1])
-        corners = [np.array(c) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
-        for side in range(4):
-            start, end = corners[side], corners[(side + 1) % 4]
-            length, ahead, inward, _ = _directed(start, end)
+        corners = _corners((xs[0], ys[0], xs[-1], ys[-1]))
+        for side, start in enumerate(corners):
+            length, ahead, inward, _ = _directed(start, corners[(side + 1) % 4])
             for along in np.arange(0.0, length, 9.0):
                 spot = start + (along + rng.uniform(-3, 3)) * ahead - rng.uniform(6.0, 25.0) * inward
                 if rng.random() < (1.0 if self.open else 0.7):
@@ -325,6 +303,12 @@ class _Town:
                 else:
                     frame = objects.frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)
                     objects.building(self.soup, rng, frame, float(rng.uniform(8, 14)), float(rng.uniform(7, 11)))
+
+
+def _corners(rectangle: Rectangle) -> FloatArray:
+    """South west, south east, north east and north west, ``(4, 2)``."""
+    x0, y0, x1, y1 = rectangle
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
 
 
 def _directed(start: FloatArray, end: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:

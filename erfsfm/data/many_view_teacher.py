@@ -102,20 +102,12 @@ class DriveLabels:
 
     def measure_poses(self, weights: str) -> None:
         """Run the SLAM system on the drive and keep its poses."""
-        recording = self.recording
-        # in order and at full size, which `Video` is not made for
-        frames = None if recording.video is None else VideoFrames(recording.video.path, counted_frames=0)
-
-        def put_image(index: int, path: Path) -> Path:
-            if frames is None:
-                placed = path.with_suffix(recording.images[index].suffix)
-                placed.symlink_to(recording.images[index].resolve())
-                return placed
-            placed = path.with_suffix(".png")
-            cv2.imwrite(str(placed), frames.read(recording.start + index)[..., ::-1])
-            return placed
-
-        T_world_camera = drive_poses(recording.frames_name, len(recording), recording.camera, put_image, weights)
+        recording, video = self.recording, self.recording.video
+        images: Iterable[Path | NDArray[np.uint8]] = recording.images
+        if video is not None:  # in order and at full size, which `Video` is not made for
+            frames = VideoFrames(video.path, counted_frames=0)
+            images = (frames.read(recording.start + index) for index in range(len(recording)))
+        T_world_camera = drive_poses(recording.frames_name, images, recording.camera, weights)
         write_atomically(self.weights_file, lambda path: path.write_text(weights))
         self.keep_poses(T_world_camera)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import Image, read_image, read_values, resize_image
+from erfsfm.common.readers.images import Image, read_depth_map, read_image, resize_image
 from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import Fidelity
@@ -138,7 +138,7 @@ class Recording:
     def true_depth(self, index: int) -> NDArray[np.float32] | None:
         """z-depth in metres ``(H, W)``, 0 where unknown; None where the frame has no depth."""
         path = None if self.depth is None else self.depth[index]
-        return None if path is None else read_values(path).astype(np.float32) / np.float32(256)
+        return None if path is None else read_depth_map(path).astype(np.float32)
 
     def shrunk_depth(self, index: int, height: int, width: int) -> NDArray[np.float32]:
         """As `true_depth` of a frame that has it, by the nearest pixels at another size, of ``image`` as a rule."""

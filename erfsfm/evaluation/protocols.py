@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -146,7 +147,33 @@ def pose_protocol(
     No snippet spans a gap, and a stretch between gaps that is shorter than one is passed over. In paper fidelity the
     truth is that of camera 0, whichever camera took the images.
     """
-    return [row for name in sequences for row in _pose_rows(networks, root, name, fidelity, allow_leak)]
+    length = networks.sources + 1
+    rows = []
+    for name in sequences:
+        parts = named_recordings(root, name)
+        first, last = parts[0], parts[-1]
+        shown = str(FrameRange(first.name, first.start, last.start + len(last))) if "[" in name else first.name
+        leak = refuse_leak(networks, [part.frames_name for part in parts], allow_leak)
+        if length != 5:
+            raise DataError(f"the snippet protocol needs networks with 4 sources; these have {networks.sources}")
+        snippets, predicted = [], []
+        for part in parts:
+            T_world_camera = part.true_poses(fidelity)
+            if T_world_camera is None:
+                raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
+            snippets.append(snippets_from_trajectory(T_world_camera, length))
+            predicted += [snippet_from_network(networks.poses(images)) for images in windows(networks, part)]
+        if not predicted:
+            longest = max(map(len, parts))
+            raise DataError(f"{shown} has {longest} frames without a gap; a snippet needs {length}")
+        true = np.concatenate(snippets)
+        straight = np.tile(np.eye(4), (len(true), length, 1, 1))
+        straight[:, :, 2, 3] = np.arange(length)
+        for method, guess in (("networks", np.stack(predicted)), ("straight constant motion", straight)):
+            errors = asdict(snippet_errors(guess, true, fidelity=fidelity))
+            count = errors.pop("count")
+            rows.append({"method": method, "recording": shown, **errors, "snippets": count, "leak": leak})
+    return rows
 
 
 def named_recordings(root: Path, name: str) -> list[Recording]:
@@ -165,38 +192,6 @@ def named_recordings(root: Path, name: str) -> list[Recording]:
     if not chosen:
         raise DataError(f"{name} names no frame of a recording: found {', '.join(w.frames_name for w in wholes)}")
     return chosen
-
-
-def _pose_rows(
-    networks: PoseDepthNetworks, root: Path, name: str, fidelity: Fidelity, allow_leak: bool
-) -> list[dict[str, Any]]:
-    """The networks' row and that of the baseline, of all parts of a sequence."""
-    length = networks.sources + 1
-    parts = named_recordings(root, name)
-    first, last = parts[0], parts[-1]
-    shown = str(FrameRange(first.name, first.start, last.start + len(last))) if "[" in name else first.name
-    leak = refuse_leak(networks, [part.frames_name for part in parts], allow_leak)
-    if length != 5:
-        raise DataError(f"the snippet protocol needs networks with 4 sources; these have {networks.sources}")
-    snippets, predicted = [], []
-    for part in parts:
-        T_world_camera = part.true_poses(fidelity)
-        if T_world_camera is None:
-            raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
-        snippets.append(snippets_from_trajectory(T_world_camera, length))
-        predicted += [snippet_from_network(networks.poses(images)) for images in windows(networks, part)]
-    if not predicted:
-        longest = max(map(len, parts))
-        raise DataError(f"{shown} has {longest} frames without a gap; a snippet needs {length}")
-    true = np.concatenate(snippets)
-    straight = np.tile(np.eye(4), (len(true), length, 1, 1))
-    straight[:, :, 2, 3] = np.arange(length)
-    rows = []
-    for method, guess in (("networks", np.stack(predicted)), ("straight constant motion", straight)):
-        errors = snippet_errors(guess, true, fidelity=fidelity)
-        row = {"method": method, "recording": shown, "ate_mean": errors.ate_mean, "ate_std": errors.ate_std}
-        rows.append(row | {"re_mean": errors.re_mean, "re_std": errors.re_std, "snippets": errors.count, "leak": leak})
-    return rows
 
 
 def windows(networks: PoseDepthNetworks, recording: Recording) -> Iterator[list[NDArray[np.uint8]]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import list_images, read_image, read_values
+from erfsfm.common.readers.images import list_images, read_depth_map, read_image
 from erfsfm.common.readers.kitti import find_drives
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
@@ -73,17 +73,10 @@ def _of_pairs(root: Path) -> list[Street]:
 
 
 def _pair(image_file: Path, truth_file: Path) -> tuple[Image, Depth]:
-    image, truth = read_image(image_file), _metres(truth_file)
+    image, truth = read_image(image_file), read_depth_map(truth_file).astype(np.float32)
     if image.shape[:2] != truth.shape:
         raise DataError(f"{truth_file} has size {truth.shape[::-1]}, and its image {image.shape[1::-1]}: give one size")
     return image, truth
-
-
-def _metres(path: Path) -> Depth:
-    values = read_values(path)
-    if values.dtype != np.uint16 or values.ndim != 2:
-        raise DataError(f"{path} is no 16-bit depth map with one channel (metres x 256, 0 where unknown)")
-    return values.astype(np.float32) / np.float32(256)
 
 
 def _of_drives(root: Path) -> list[Street]:

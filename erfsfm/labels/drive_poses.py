@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -25,28 +26,28 @@ SETTINGS = ("mapping.enabled=false", "output.report=false")
 
 
 def drive_poses(
-    name: str, count: int, camera: Pinhole, put_image: Callable[[int, Path], Path], weights: str
+    name: str, images: Iterable[Path | NDArray[np.uint8]], camera: Pinhole, weights: str
 ) -> NDArray[np.float64]:
-    """Run the SLAM system on a drive.
+    """Run the SLAM system on a drive; ``TrainingError`` where it gives no trajectory or no scale.
 
     Args:
         name: of the drive, for errors.
-        count: number of frames.
+        images: of every frame, files or RGB ``(H, W, 3)``.
         camera: of the images.
-        put_image: makes the image of a frame appear at the path given without suffix, and returns the file.
         weights: of the networks that the system uses.
 
     Returns:
-        ``T_world_camera`` ``(count, 4, 4)``, translations in heights of the camera over the road.
-
-    Raises:
-        TrainingError: the system could not be started or gives no trajectory for this drive.
+        ``T_world_camera`` ``(N, 4, 4)``, translations in heights of the camera over the road.
     """
     with tempfile.TemporaryDirectory(prefix="erfsfm-teacher-") as temporary:
         drive, output = Path(temporary) / "drive", Path(temporary) / "run"
         drive.mkdir()
-        for index in range(count):
-            put_image(index, drive / f"{index:06d}")
+        for index, image in enumerate(images):
+            place = drive / f"{index:06d}.png"
+            if isinstance(image, Path):
+                place.with_suffix(image.suffix).symlink_to(image.resolve())
+            else:
+                cv2.imwrite(str(place), image[..., ::-1])
         numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         (drive / "camera.yaml").write_text(yaml.safe_dump(numbers | {"fps": FPS, "camera_height_m": CAMERA_HEIGHT_M}))
         words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights, "--device", "cpu"]

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
-from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import first_usual, read_image, read_values, stretch_of
 from erfsfm.common.readers.numbering import NumberedFiles
 from slam.frames import Image
-from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import MissingFrameError, SequenceError
 
 _MAX_GAP_FRAMES = 100
-KITTI_PER_METRE = 256.0  # stored in depth maps
 
 
 class Sized(Protocol):
@@ -98,14 +92,3 @@ def too_long(files: NumberedFiles, first: int, last: int) -> SequenceError:
         f"no images {files.file_name(first)} to {files.file_name(last)} in {files.paths[0].parent}: a gap of "
         f"{last - first + 1} frames is too long to interpolate; split the recording there"
     )
-
-
-def read_depth_map(path: Path, per_metre: float = KITTI_PER_METRE, unknown: int = 0) -> FloatArray:
-    """A depth map ``(h, w)`` in metres, 0 where unknown, from a 16-bit grey PNG.
-
-    ``per_metre`` is the stored value of one metre, ``unknown`` one of pixels without depth, beside 0.
-    """
-    values = read_values(path)
-    if values.ndim != 2 or values.dtype != np.uint16:
-        raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
-    return np.where(values == unknown, 0, values) / per_metre

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from erfsfm.common.files import read_text
 from erfsfm.common.readers import kitti
 from erfsfm.common.readers.camera_file import CameraFile
-from erfsfm.common.readers.images import has_images, list_images
+from erfsfm.common.readers.images import has_images, list_images, read_depth_map
 from erfsfm.common.readers.kitti import CalibrationFile, OdometryRoot
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
 from erfsfm.common.readers.pinhole import Pinhole
@@ -29,7 +29,7 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import DEFAULT_FPS, find_camera_file
-from slam.sequences.images import ImageFiles, read_depth_map
+from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near
 from slam.sequences.recording import (

@@ -20,7 +20,7 @@ import numpy as np
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
-from erfsfm.common.readers.images import first_size, has_images, list_images
+from erfsfm.common.readers.images import first_size, has_images, list_images, read_depth_map
 from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
 from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
@@ -29,7 +29,7 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, find_camera_file, pinhole_keys, read_explicit, read_opencv_yaml
-from slam.sequences.images import ImageFiles, read_depth_map
+from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import pose_files, poses_near, poses_of, read_matrix
 from slam.sequences.recording import ArrayReader, RecordedSequence, Source, read_stamps, require_stamps

@@ -141,6 +141,17 @@ def read_values(path: Path) -> NDArray[Any]:
     return decode_values(_file_bytes(path), f"image {path}")
 
 
+def read_depth_map(path: Path, per_metre: float = 256.0, unknown: int = 0) -> NDArray[np.float64]:
+    """A depth map ``(H, W)`` in metres, 0 where unknown, from a 16-bit grey PNG.
+
+    ``per_metre`` is the stored value of one metre, ``unknown`` one of pixels without depth, beside 0.
+    """
+    values = read_values(path)
+    if values.ndim != 2 or values.dtype != np.uint16:
+        raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
+    return np.where(values == unknown, 0, values) / per_metre
+
+
 def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
     """As `read_values`, of the bytes of a file; ``where`` they come from is for messages, ``flags`` are OpenCV's."""
     if not data:

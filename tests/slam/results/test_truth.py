@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.readers.images import read_depth_map
 from slam.config.sections import ScaleMode
 from slam.frames import Intrinsics, Sequence
 from slam.frontend.scale.metric_scale import LengthUnit, Scale
@@ -20,7 +21,6 @@ from slam.mapping.filters import KeyframeDepth
 from slam.results.truth import DepthQuality, find_truth, map_errors, projected, true_depth
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.images import read_depth_map
 from slam.sequences.recording import RecordedSequence, Source
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root

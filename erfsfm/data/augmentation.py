@@ -13,6 +13,10 @@ from erfsfm.geometry.camera import Camera
 
 Images = list[NDArray[np.uint8]]
 Maps = list[NDArray[np.float32]]
+Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
+
+_EACH = 0.6  # chance of each weather
+_BLUR_SAMPLES = 6  # images averaged into a blurred one
 
 
 def augment(
@@ -99,22 +103,14 @@ def _recolour(images: Images, strength: float, rng: np.random.Generator) -> Imag
     return [cv2.LUT(image, table) for image in images]
 
 
-Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
-
-_EACH = 0.6  # chance of each
-_BLUR_SAMPLES = 6  # images averaged into a blurred one
-
-
 def weathered(images: Images, rng: np.random.Generator) -> Images:
-    """The same views under random weather; positions of pixels do not change. A single image may get cast shadows.
+    """The same views in time order under random weather; positions of pixels do not change.
 
-    Args:
-        images: ``(H, W, 3)`` uint8 each, in time order.
-        rng: of all random draws.
+    A single image may get cast shadows: those of a snippet would have to move with the road.
     """
     exposure, blur, rain, shadow = rng.random(4) < _EACH
     seen: Pictures = [np.asarray(image / 255, dtype=np.float32) for image in images]
-    if shadow and len(seen) == 1:  # those of a snippet would have to move with the road
+    if shadow and len(seen) == 1:
         seen = [_shadowed(seen[0], rng)]
     if blur:
         seen = _blurred(seen, rng)

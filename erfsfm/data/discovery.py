@@ -79,12 +79,13 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
     for camera, files, (height, width) in _cameras(folders):
         calibration, row = CalibrationFile(sequence / ODOMETRY_CALIBRATION), f"P{camera}"
         pinhole = calibration.pinhole(row, width, height)
+        depth = tuple(sequence / "depth_2" / f"{image.stem}.png" for image in files.paths)
         tx, ty, tz = (float(value) for value in calibration.T_camera_cam0(row)[:3, 3])
         whole = Recording(
             root.recording_name(sequence.name),
             files.paths,
             Camera.of(pinhole),
-            depth=_depth(sequence, files.paths) if camera == ODOMETRY_CAMERAS[0] else None,
+            depth=depth if camera == ODOMETRY_CAMERAS[0] and all(path.is_file() for path in depth) else None,
             poses_file=poses if poses.is_file() else None,
             camera_height_m=_simulated_height(root),
             t_camera_cam0=(tx, ty, tz),
@@ -125,12 +126,6 @@ def _cameras(folders: dict[Number, Path]) -> Iterator[tuple[Number, NumberedFile
     for camera in [camera for camera in present if int(camera) in _COLOUR] or present[:1]:
         files = by_number(images[camera])
         yield camera, files, first_size(files.paths)
-
-
-def _depth(sequence: Path, images: tuple[Path, ...]) -> tuple[Path, ...] | None:
-    """The depth maps of the images; None where one of them has none."""
-    maps = tuple(sequence / "depth_2" / f"{image.stem}.png" for image in images)
-    return maps if all(path.is_file() for path in maps) else None
 
 
 def _own(root: Path) -> list[Recording]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass
 from typing import Literal
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 MINIMUM_DEPTH_M = 1e-3
 CAP_M = 80.0  # farther truth is not compared
 Crop = Literal["none", "garg"]
-Scaling = Literal["none", "median"]
 Clipping = Literal["after", "before"]
 
 
@@ -28,10 +27,6 @@ class DepthErrors:
     a2: float
     a3: float
     scale: float
-
-    def as_dict(self) -> dict[str, float]:
-        """Plain numbers by name."""
-        return asdict(self)
 
 
 def valid_pixels(true_depth: NDArray[np.float32], cap_m: float, crop: Crop) -> NDArray[np.bool_]:
@@ -52,7 +47,7 @@ def depth_errors(
     true_depth: NDArray[np.float32],
     cap_m: float = 80.0,
     crop: Crop = "none",
-    scaling: Scaling | float = "median",
+    scaling: Literal["median"] | float = "median",
     clipping: Clipping = "after",
 ) -> DepthErrors | None:
     """Compare one depth map with the truth.
@@ -77,7 +72,7 @@ def depth_errors(
     guess = predicted[mask].astype(np.float64)
     if clipping == "before":
         guess = np.clip(guess, MINIMUM_DEPTH_M, cap_m)
-    scale = _scale(guess, truth, scaling)
+    scale = float(np.median(truth) / np.median(guess)) if scaling == "median" else scaling
     guess = guess * scale
     if clipping == "after":
         guess = np.clip(guess, MINIMUM_DEPTH_M, cap_m)
@@ -93,12 +88,6 @@ def depth_errors(
         a3=float(np.mean(ratio < 1.25**3)),
         scale=scale,
     )
-
-
-def _scale(guess: NDArray[np.float64], truth: NDArray[np.float64], scaling: Scaling | float) -> float:
-    if scaling == "median":
-        return float(np.median(truth) / np.median(guess))
-    return 1.0 if scaling == "none" else float(scaling)
 
 
 def standard_error(values: Sequence[float]) -> float | None:
@@ -117,5 +106,4 @@ def mean_errors(errors: list[DepthErrors]) -> DepthErrors:
     """Mean over images, each image counting once."""
     if not errors:
         raise ValueError("no image with true depth to average over")
-    columns = {key: float(np.mean([e.as_dict()[key] for e in errors])) for key in errors[0].as_dict()}
-    return DepthErrors(**columns)
+    return DepthErrors(*np.mean([astuple(each) for each in errors], axis=0).tolist())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -46,17 +47,16 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
             raise DataError(f"split {path} cannot be read: it is no text of a frame a line ({error})") from error
         frames = [RawFrame.parse(line, base) for line in lines if line.strip()]
     else:
-        frames = [_raw_frame(recording, index, base) for recording, index in read_split_file(split).test_frames()]
+        frames = []
+        for recording, index in read_split_file(split).test_frames():
+            kind, _, drive = recording.partition("/")
+            if kind != "kitti_raw":
+                wanted = "kitti_raw/2011_09_26_drive_0002[0:64:3]"
+                raise DataError(f"'{recording}' is no drive of KITTI raw: wanted {wanted}")
+            frames.append(RawFrame.parse(f"{drive} {index}", base))
     if not frames:
         raise DataError(f"split {split} names no frames to test on")
     return frames
-
-
-def _raw_frame(recording: str, index: int, base: Path) -> RawFrame:
-    kind, _, drive = recording.partition("/")
-    if kind != "kitti_raw":
-        raise DataError(f"'{recording}' is no drive of KITTI raw: wanted kitti_raw/2011_09_26_drive_0002[0:64:3]")
-    return RawFrame.parse(f"{drive} {index}", base)
 
 
 def eigen_protocol(
@@ -141,7 +141,7 @@ def _row(method: str, scaling: str, errors: Sequence[DepthErrors], wanted: int, 
     if not errors:
         row |= {"abs_rel": None, "abs_rel_reason": "the car stands still in every frame"}
         return row | {"images": 0, "leak": leak}
-    mean = mean_errors(list(errors)).as_dict()
+    mean = asdict(mean_errors(list(errors)))
     row |= {key: value if np.isfinite(value) else None for key, value in mean.items()}
     row |= {f"{key}_reason": "an image has no scale" for key, value in mean.items() if not np.isfinite(value)}
     scales = np.array([error.scale for error in errors])

@@ -52,10 +52,8 @@ def many_view_protocol(
         One row for each recording; ``known`` is the share of pixels that were compared.
     """
     recordings = [each for name in sequences for each in named_recordings(root, name)] or discover(root)
-    if cache is not None:
-        return many_view_errors(networks, recordings, cache, allow_leak, progress, every)
     with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:
-        return many_view_errors(networks, recordings, Path(folder), allow_leak, progress, every)
+        return many_view_errors(networks, recordings, cache or Path(folder), allow_leak, progress, every)
 
 
 def many_view_errors(
@@ -78,8 +76,8 @@ def many_view_errors(
         errors, known = _compare(networks, recording, teacher)
         if not errors:
             raise DataError(f"no depth could be measured in {recording.frames_name}: the camera has to travel")
-        mean, scales = mean_errors(errors).as_dict(), np.array([each.scale for each in errors])
-        row = {"method": "networks", "recording": recording.frames_name} | {key: mean[key] for key in _RATIOS}
+        mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
+        row = {"method": "networks", "recording": recording.frames_name} | {key: getattr(mean, key) for key in _RATIOS}
         row |= {"scale_spread": float(scales.std() / scales.mean()), "known": float(np.mean(known))}
         rows.append(row | {"images": len(errors), "leak": leak})
     return rows

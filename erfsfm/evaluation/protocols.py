@@ -162,7 +162,7 @@ def pose_protocol(
             if T_world_camera is None:
                 raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
             snippets.append(snippets_from_trajectory(T_world_camera, length))
-            predicted += [snippet_from_network(networks.poses(images)) for images in windows(networks, part)]
+            predicted += [snippet_from_network(networks.poses(images)) for images in _windows(part, length)]
         if not predicted:
             longest = max(map(len, parts))
             raise DataError(f"{shown} has {longest} frames without a gap; a snippet needs {length}")
@@ -194,12 +194,12 @@ def named_recordings(root: Path, name: str) -> list[Recording]:
     return chosen
 
 
-def windows(networks: PoseDepthNetworks, recording: Recording) -> Iterator[list[NDArray[np.uint8]]]:
-    """The images of each window of a pose network; no more of them are held than one window has."""
-    images: deque[NDArray[np.uint8]] = deque(maxlen=networks.sources + 1)
+def _windows(recording: Recording, length: int) -> Iterator[list[NDArray[np.uint8]]]:
+    """The images of each window of frames; no more of them are held than one window has."""
+    images: deque[NDArray[np.uint8]] = deque(maxlen=length)
     for index in range(len(recording)):
         images.append(recording.image(index, recording.camera.height, recording.camera.width))
-        if len(images) == images.maxlen:
+        if len(images) == length:
             yield list(images)
 
 
@@ -207,7 +207,7 @@ def _depth_row(method: str, streets: list[list[DepthErrors]], before: list[list[
     """Means over streets of the means over their frames, and their ratio to those of other networks ``before``."""
     means = [mean_errors(errors) for errors in streets]
     abs_rel = [each.abs_rel for each in means]
-    row: dict[str, Any] = {"method": method, **mean_errors(means).as_dict(), "abs_rel_se": standard_error(abs_rel)}
+    row: dict[str, Any] = {"method": method, **asdict(mean_errors(means)), "abs_rel_se": standard_error(abs_rel)}
     if before is not None:
         row["ratio"], row["ratio_se"] = mean_ratio(abs_rel, [mean_errors(errors).abs_rel for errors in before])
     row |= {f"{key}_reason": "one street" for key in ("abs_rel_se", "ratio_se") if key in row and row[key] is None}

@@ -74,13 +74,7 @@ def road_plane(
 
 
 def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDArray[np.bool_]:
-    """Pixels on the road, also without measurements of their own: nearly all known neighbours lie on it, ``(H, W)``.
-
-    Args:
-        inverse_depth: ``(H, W)``.
-        known: where it may be used, ``(H, W)``.
-        road: inverse depth of the road at every pixel, ``(H, W)``, not positive above the horizon.
-    """
+    """Pixels on the road, ``(H, W)``, as in `impose_road`: nearly all neighbours lie on it that are ``known``."""
     height, width = inverse_depth.shape
     window = (2 * int(AROUND[1] * width / 2) + 1, 2 * int(AROUND[0] * height / 2) + 1)
     agreeing = known & (np.abs(inverse_depth - road) < NEAR * road)
@@ -90,14 +84,9 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
 
 
 def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bool_]:
-    """Pixels measured clearly below the road, with a rim around them, ``(H, W)``.
+    """Pixels measured clearly below the road, with a rim around them, ``(H, W)``; as in `impose_road`.
 
     These are dynamic objects that move with the camera, like a car ahead, and only appear far away.
-
-    Args:
-        inverse_depth: ``(H, W)``.
-        sigma: of the inverse depth, ``(H, W)``.
-        road: inverse depth of the road at every pixel, ``(H, W)``, not positive above the horizon.
     """
     under = (road > 0) & (inverse_depth + SIGMAS_UNDER * sigma < (1 - NEAR) * road)
     rim = np.ones((RIM_PX, RIM_PX), np.uint8)

@@ -16,20 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from slam.evaluation.surface import (
-    RANGE_M,
-    SAMPLE_VOXEL_M,
-    SPARSE_VIEW_STEP_M,
-    VIEW_STEP_DEG,
-    VIEW_STEP_M,
-    Indices,
-    SurfaceTruth,
-    accumulated,
-    length_m,
-    nearby,
-    stretches,
-    thinned,
-)
+from slam.evaluation.surface import RANGE_M, Indices, SurfaceTruth, accumulated, nearby, stretches, thinned
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
 from slam.mapping.views import moved_rows
@@ -42,6 +29,8 @@ COVERED_WITHIN_M = 0.3
 F_SCORES_M = {"0.2": 0.2, "0.5": 0.5}
 BINS_M = ((0.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
 OUTLIER_M = 1.0
+VIEW_STEP_M, SPARSE_VIEW_STEP_M, VIEW_STEP_DEG = 1.0, 3.0, 5.0  # sparse where views do not measure the accuracy
+SAMPLE_VOXEL_M = 0.2
 
 _WALL_NEAR_M, _WALL_FAR_M = 0.3, 2.0  # of the second surface in front of the first
 _PARALLEL = 0.7  # least cosine of the two normals
@@ -159,7 +148,8 @@ def compare(
             found[name].append((distances, away[own], in_field, to_map, surface_range))
         del to_surface  # it holds the surface
     together = {name: MapDistances(*map(np.concatenate, zip(*each))) for name, each in found.items()}
-    return together, length_m(T_world_camera, parts)
+    to_next = np.append(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1), 0.0)
+    return together, float(sum(to_next[part].sum() for part in parts))
 
 
 _Kind = TypeVar("_Kind", bound=SurfaceMetrics)
@@ -174,12 +164,8 @@ def placed_metrics(kind: type[_Placed], distances: MapDistances, **more: Any) ->
     for from_m, to_m in BINS_M:
         of_map = (distances.map_range >= from_m) & (distances.map_range < to_m)
         of_surface = (distances.surface_range >= from_m) & (distances.surface_range < to_m)
-        ring = {
-            "from_m": from_m,
-            "to_m": to_m,
-            "map_points": int(of_map.sum()),
-            "surface_points": int(of_surface.sum()),
-        }
+        counts = {"map_points": int(of_map.sum()), "surface_points": int(of_surface.sum())}
+        ring: dict[str, Any] = {"from_m": from_m, "to_m": to_m, **counts}
         curve.append(_metrics(SurfaceMetrics, own[of_map], true[of_surface], _LEAST_IN_BIN, **ring))
     share = _share(in_field) if len(in_field) else _NO_MAP
     fair = _metrics(SurfaceMetrics, own[in_field], true[near], 1, share=share)

@@ -21,10 +21,6 @@ RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
 STRETCH_M = 100.0
 MOST_STRETCHES = 5
 TRUTH_VOXEL_M = 0.05
-SAMPLE_VOXEL_M = 0.2
-VIEW_STEP_M = 1.0
-VIEW_STEP_DEG = 5.0
-SPARSE_VIEW_STEP_M = 3.0  # where views do not measure the accuracy
 
 _BEYOND_M = 5.0  # of the range of map points: a wrong one may be nearest to surface out there
 _WAITING_POINTS = 2_000_000
@@ -85,13 +81,6 @@ def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices
         return parts
     chosen = ((np.arange(MOST_STRETCHES) + 0.5) * len(parts) / MOST_STRETCHES).astype(np.intp)
     return [parts[k] for k in chosen]
-
-
-def length_m(T_world_camera: FloatArray, parts: list[Indices]) -> float:
-    """Length of the road in these stretches, each frame's up to the next frame."""
-    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
-    to_next = np.append(steps, 0.0)
-    return float(sum(to_next[part].sum() for part in parts))
 
 
 def nearby(T_world_camera: FloatArray, views: Indices, part: Indices) -> Indices:

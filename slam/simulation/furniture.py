@@ -1,6 +1,7 @@
 """Furniture of boxes. Each piece stands on a frame whose x axis runs along a wall and whose y axis leaves it."""
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 
@@ -11,6 +12,7 @@ WOODS = ((0.50, 0.34, 0.20), (0.68, 0.52, 0.34), (0.82, 0.80, 0.76), (0.30, 0.21
 CLOTHS = ((0.25, 0.32, 0.45), (0.55, 0.30, 0.25), (0.42, 0.44, 0.42), (0.62, 0.56, 0.45), (0.24, 0.38, 0.32))
 PAINTS = ((0.70, 0.20, 0.16), (0.15, 0.35, 0.60), (0.85, 0.68, 0.20), (0.20, 0.48, 0.36), (0.85, 0.82, 0.76))
 
+Pair = tuple[float, float]
 Piece = Callable[[Soup, np.random.Generator, FloatArray, float], None]
 
 
@@ -130,9 +132,7 @@ def cartons(
 def rack(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) -> None:
     """Cartons on three boards between posts."""
     steel = soup.instance(Material.METAL, colour(rng, *PAINTS))
-    for x in (0.0, width - 0.06):
-        for y in (0.0, 0.54):
-            solid(soup, frame, (x, y, 0), (0.06, 0.06, 2.6), steel)
+    _legs(soup, frame, (0.0, width - 0.06), (0.0, 0.54), (0.06, 0.06, 2.6), steel)
     for level in (0.15, 0.95, 1.75):
         solid(soup, frame, (0, 0, level), (width, 0.6, 0.05), steel)
         raised = frame.copy()
@@ -149,17 +149,18 @@ def dining(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float
         for front, back in ((-0.25, -0.29), (depth - 0.2, depth + 0.21)):
             solid(soup, frame, (left, front, 0.42), (0.42, 0.45, 0.04), seat)
             solid(soup, frame, (left, back, 0.42), (0.42, 0.04, 0.5), seat)
-            for x in (left, left + 0.38):
-                for y in (front, front + 0.41):
-                    solid(soup, frame, (x, y, 0), (0.04, 0.04, 0.42), seat)
+            _legs(soup, frame, (left, left + 0.38), (front, front + 0.41), (0.04, 0.04, 0.42), seat)
 
 
 def _table(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float) -> None:
     board = wood(soup, rng)
     solid(soup, frame, (0, 0, 0.69), (width, depth, 0.04), board)
-    for x in (0.02, width - 0.08):
-        for y in (0.02, depth - 0.08):
-            solid(soup, frame, (x, y, 0), (0.06, 0.06, 0.69), board)
+    _legs(soup, frame, (0.02, width - 0.08), (0.02, depth - 0.08), (0.06, 0.06, 0.69), board)
+
+
+def _legs(soup: Soup, frame: FloatArray, xs: Pair, ys: Pair, size: tuple[float, float, float], look: int) -> None:
+    for x, y in product(xs, ys):
+        solid(soup, frame, (x, y, 0), size, look)
 
 
 def _things(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float, height: float) -> None:

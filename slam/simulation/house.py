@@ -120,7 +120,7 @@ class Floor:
         self._clearance = np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL, dtype=np.float64)
         self._cells = np.argwhere(self._clearance >= _CLEAR_M)[:, ::-1]  # (C, 2), column and row
         self._graph = self._connect()
-        self.places, self.room, self._at = self._choose(areas, np.random.default_rng([seed, 52]))
+        self.places, self.room, self._at = self._choose(house.rooms, np.random.default_rng([seed, 52]))
 
     def clearance(self, points: FloatArray) -> FloatArray:
         """Distance in plan from points ``(M, 2)`` to what stands there, metres, ``(M,)``."""
@@ -166,15 +166,15 @@ class Floor:
         joined = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
         return coo_array(joined, shape=(len(self._cells),) * 2).tocsr()
 
-    def _choose(self, areas: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, IntArray, IntArray]:
+    def _choose(self, house_rooms: list[Room], rng: np.random.Generator) -> tuple[FloatArray, IntArray, IntArray]:
         """Up to five places a room: where they are, their rooms and their cells."""
         _, part = connected_components(self._graph, directed=False)
         centres = self._centres(self._cells)
         roomy = (part == np.bincount(part).argmax()) & (self.clearance(centres) >= _PLACE_CLEAR_M)
         chosen: list[int] = []
         rooms: list[int] = []
-        for number, (x0, y0, x1, y1) in enumerate(areas):
-            inside = np.flatnonzero(roomy & (centres > (x0, y0)).all(axis=1) & (centres < (x1, y1)).all(axis=1))
+        for number, room in enumerate(house_rooms):
+            inside = np.flatnonzero(roomy & room.contains(centres))
             found = rng.choice(inside, min(len(inside), 5), replace=False)
             chosen.extend(found)
             rooms.extend([number] * len(found))

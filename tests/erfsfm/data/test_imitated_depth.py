@@ -18,18 +18,16 @@ from erfsfm.training.run import train
 from erfsfm.training.supervision import imitated
 
 
-def imitation(root: Path, teacher: dict[str, Any] | None = None, **sections: dict[str, Any]) -> ExperimentConfig:
+def imitation(root: Path) -> ExperimentConfig:
     """An experiment on one drive that imitates the depth of ``sim``."""
     tree: dict[str, dict[str, Any]] = {
+        "teacher": {"views": "network", "slam_weights": "sim", "structure_weight": 1},
         "network": {"height": 64, "width": 96, "sources": 2, "depth_width": 0.1, "pose_width": 0.1},
         "data": {"workers": 0, "flip": 1, "zoom": 1, "validation": [], "roots": [root]},
         "loss": {"photometric_weight": 0, "smoothness_weight": 0},
         "training": {"networks": "depth", "batch": 2, "steps": 1},
     }
-    for name, section in sections.items():
-        tree[name] |= section
-    given = {"views": "network", "slam_weights": "sim", "structure_weight": 1} | (teacher or {})
-    return ExperimentConfig.model_validate(tree | {"teacher": given})
+    return ExperimentConfig.model_validate(tree)
 
 
 def test_the_label_is_what_the_network_gives(write_root: Callable[..., Path], tmp_path: Path) -> None:

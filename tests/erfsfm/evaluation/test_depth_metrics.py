@@ -23,7 +23,7 @@ def test_perfect_up_to_scale() -> None:
 def test_by_hand_without_scaling() -> None:
     truth = np.array([[10.0, 20.0, 0.0]], np.float32)
     guess = np.array([[12.0, 10.0, 5.0]], np.float32)
-    errors = depth_errors(guess, truth, scaling="none")
+    errors = depth_errors(guess, truth, scaling=1.0)
     assert errors is not None
     assert errors.scale == 1
     assert errors.abs_rel == pytest.approx((0.2 + 0.5) / 2)
@@ -52,8 +52,8 @@ def test_valid_pixels() -> None:
 
 def test_every_image_counts_once() -> None:
     truth = np.full((1, 4), 10, np.float32)
-    first = depth_errors(truth, truth, scaling="none")
-    second = depth_errors(truth * 1.5, truth, scaling="none")
+    first = depth_errors(truth, truth, scaling=1.0)
+    second = depth_errors(truth * 1.5, truth, scaling=1.0)
     assert first is not None
     assert second is not None
     assert mean_errors([first, second]).abs_rel == pytest.approx(0.25)

@@ -1,49 +1,74 @@
-"""Labels from many views against the simulated world, whose depth and poses are exact."""
+"""Labels from many views and from refined learned depth against the simulated world, whose truth is exact."""
 
-import functools
+from __future__ import annotations
 
+from functools import cache
+
+import cv2
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
-from erfsfm.labels.many_views import direction_of_travel, label, sky_mask
+from erfsfm.labels.many_views import (
+    NEIGHBOURS,
+    direction_of_travel,
+    in_camera_heights,
+    label,
+    refined_label,
+    shrunk,
+    sky_mask,
+)
+from erfsfm.mvs.flow import Array, measure
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
-NEIGHBOURS = (-4, -2, -1, 1, 2, 4)
+NEAR = (-1, 1, 3)
 
 
-@functools.cache
+@cache
 def street() -> SimulatedStreet:
     return SimulatedStreet(SimulationOptions(frames=250, seed=703))
 
 
-@functools.cache
-def images(index):
-    return [street().render(index + k).image[..., 1].copy() for k in (0, *NEIGHBOURS)]
+@cache
+def grey(frame: int) -> NDArray[np.uint8]:
+    return street().render(frame).image[..., 1].copy()
 
 
-def truth(index):
-    """Inverse depth in camera heights, 0 where it is unknown."""
-    depth = street().depth(index)
-    return np.where(depth > 0, street().camera_height_m / np.maximum(depth, 1e-6), 0)
-
-
-@functools.cache
-def measured(index):
-    T = np.linalg.inv(street().T_world_camera[[index + k for k in NEIGHBOURS]]) @ street().T_world_camera[index]
+def seen(frame: int, others: tuple[int, ...]) -> tuple[NDArray[np.uint8], list[NDArray[np.uint8]], Array, Array]:
+    """A frame, its neighbours, their camera, and ``T_neighbour_target`` in camera heights."""
+    T = np.linalg.inv(street().T_world_camera[[frame + k for k in others]]) @ street().T_world_camera[frame]
     T[:, :3, 3] /= street().camera_height_m
-    grey, *others = images(index)
-    return label(grey, others, street().K, T)
+    return grey(frame), [grey(frame + k) for k in others], street().K, T
 
 
-def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth():
-    for index in (60, 150):
-        (least, most), true = measured(index), truth(index)
-        narrow = (least > 0) & (most < 1.5 * least) & (true > 0)
-        assert narrow.mean() > 0.4
-        middle = np.sqrt(least[narrow] * most[narrow])
-        assert np.median(np.abs(middle / true[narrow] - 1)) < 0.03
-        widened = (0.9 * least[narrow] < true[narrow]) & (true[narrow] < 1.1 * most[narrow])
-        assert widened.mean() > 0.85
+@cache
+def by_flow(frame: int) -> tuple[Array, Array]:
+    return label(*seen(frame, NEIGHBOURS))
+
+
+@cache
+def truth(frame: int) -> Array:
+    """Inverse depth in camera heights, 0 where it is unknown."""
+    depth = street().depth(frame)
+    return np.where(depth > 0, street().camera_height_m / np.maximum(depth, 1e-6), 0).astype(np.float32)
+
+
+def errors(bounds: tuple[Array, Array], true: Array) -> tuple[Array, float]:
+    """Relative errors where the bounds are narrow, and the share of these pixels."""
+    least, most = bounds
+    narrow = (least > 0) & (most < 1.5 * least) & (true > 0)
+    return np.abs(np.sqrt(least[narrow] * most[narrow]) / true[narrow] - 1), float(narrow.mean())
+
+
+@pytest.mark.parametrize("frame", [60, 150])
+def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth(frame: int) -> None:
+    error, known = errors(by_flow(frame), truth(frame))
+    assert known > 0.4 and np.median(error) < 0.03
+    (least, most), true = by_flow(frame), truth(frame)
+    narrow = (least > 0) & (most < 1.5 * least) & (true > 0)
+    widened = (0.9 * least[narrow] < true[narrow]) & (true[narrow] < 1.1 * most[narrow])
+    assert widened.mean() > 0.85
 
 
 def test_the_sky_is_far_and_nothing_below_the_horizon_is_sky():
@@ -68,3 +93,48 @@ def test_direction_of_travel_is_forward_and_unknown_at_rest():
     T[0, 2, 3], T[1, 2, 3] = 1.0, -1.0  # a point ahead is farther from the camera before
     np.testing.assert_allclose(direction_of_travel(T), [0, 0, 1])
     assert direction_of_travel(np.tile(np.eye(4), (2, 1, 1))) is None
+
+
+@pytest.mark.parametrize("frame", [60, 150])
+def test_more_is_known_than_by_flow_alone_and_it_is_as_right(frame: int) -> None:
+    network = 7 * cv2.GaussianBlur(truth(frame), (0, 0), 4) ** np.float32(0.9) + np.float32(0.05)  # in its own unit
+    learned = in_camera_heights(network, measure(*seen(frame, NEIGHBOURS)))
+    assert learned is not None
+    bounds = refined_label(*seen(frame, NEAR), learned)
+    refined, known = errors(bounds, truth(frame))
+    plain, known_by_flow = errors(by_flow(frame), truth(frame))
+    assert known > known_by_flow + 0.1
+    assert refined.mean() < plain.mean() + 0.005
+    least, most = bounds
+    both = (least > 0) & np.isfinite(most) & (truth(frame) > 0)
+    between = (0.98 * least[both] <= truth(frame)[both]) & (truth(frame)[both] <= 1.02 * most[both])
+    assert between.mean() > 0.8
+
+
+def test_the_unit_of_learned_depth_may_be_off_in_a_frame() -> None:
+    exact, middles = np.maximum(truth(60), np.float32(0.008)), []
+    for unit in (0.8, 1.0, 1.25):
+        error, known = errors(refined_label(*seen(60, NEAR), np.float32(unit) * exact), truth(60))
+        assert known > 0.5
+        middles.append(np.median(error))
+    assert max(middles) < 0.02
+
+
+def test_no_scale_where_flow_measures_nothing() -> None:
+    blank = np.full((64, 128), 120, np.uint8)
+    _, _, K, T_neighbour_target = seen(60, (-1, 1))
+    measured = measure(blank, [blank] * 2, K, T_neighbour_target)
+    assert in_camera_heights(np.ones((64, 128), np.float32), measured) is None
+
+
+def test_a_smaller_label_is_wide_at_edges_and_unknown_where_a_pixel_is():
+    least = np.full((2, 6), 0.2, np.float32)
+    most = np.full((2, 6), 0.22, np.float32)
+    least[:, 3], most[:, 3] = 0.02, 0.022  # a surface ten times as far in half of a block
+    least[0, 5] = 0
+    low, high = shrunk(least, most, 2)
+    np.testing.assert_allclose([low[0, 0], high[0, 0]], [0.2, 0.22], rtol=1e-5)
+    assert low[0, 1] < 0.021
+    assert high[0, 1] > 0.21
+    assert low[0, 2] == 0
+    np.testing.assert_allclose(high[0, 2], 0.22, rtol=1e-5)

@@ -44,13 +44,6 @@ def test_noise_with_the_stated_sigmas_is_covered(student_t_dof: float) -> None:
     }
 
 
-def test_unstated_heavy_tails_change_the_coverage() -> None:
-    ratios = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0)[""]
-    assert ratios["50"] > 0.65 and ratios["95"] < 0.94
-    ratios = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0)[""]
-    assert ratios["50"] < 0.3
-
-
 def test_bounds_by_hand() -> None:
     assert squared_bound(0.95, math.inf) == pytest.approx(12.592, abs=1e-3)
     # the 50 % quantile of F(6, 6) is 1; four of six degrees of freedom are left of the variance
@@ -73,10 +66,6 @@ def test_overconfident_factors_are_found_by_source() -> None:
     assert kinds.keys() == {"", "network", LOOP_SOURCE}
     assert kinds[LOOP_SOURCE]["factors"] == 100 and kinds[LOOP_SOURCE]["95"] < 0.2
     assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0)[""]}
-
-
-def test_each_factor_has_the_bound_of_its_own_distribution() -> None:
-    normal, heavy = factors(math.inf), [replace(f, source="essential") for f in factors(4.0)]
-    covered = coverage(normal + heavy, truth(), 1.0)
-    for level, ratio in covered[""].items():
-        assert ratio == pytest.approx(np.mean([kind[level] for source, kind in covered.items() if source]))
+    heavy = [replace(f, source="essential") for f in factors(4.0)]
+    covered = coverage(honest + heavy, truth(), 1.0)  # each factor has the bound of its own distribution
+    assert covered[""]["90"] == pytest.approx((covered["network"]["90"] + covered["essential"]["90"]) / 2)

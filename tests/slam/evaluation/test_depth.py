@@ -20,7 +20,6 @@ def test_numbers_of_a_constant_error() -> None:
     errors.add(TRUTH * 1.1, TRUTH)
     errors.add(TRUTH * 0.7, TRUTH)
     summary = errors.metrics().tree()
-    assert summary is not None
     assert summary["abs_rel"] == pytest.approx(0.2)
     assert summary["median_rel"] == pytest.approx(0.2)
     assert summary["rmse_m"] == pytest.approx(np.sqrt(5.0), rel=1e-5)
@@ -34,7 +33,6 @@ def test_correct_sigmas_cover() -> None:
     for _ in range(20):
         errors.add(TRUTH * np.exp(rng.normal(0, 0.05, TRUTH.shape)), TRUTH, np.full_like(TRUTH, 0.05))
     summary = errors.metrics().tree()
-    assert summary is not None
     for level in (50, 90, 95):
         assert summary["coverage"][str(level)] == pytest.approx(level / 100, abs=0.02)
 
@@ -44,7 +42,7 @@ def test_truth_of_another_size_meets_the_nearest_pixel() -> None:
     errors = DepthErrors()
     errors.add(depth, np.repeat(np.repeat(depth, 2, axis=0), 2, axis=1))
     summary = errors.metrics().tree()
-    assert summary is not None and summary["abs_rel"] == 0
+    assert summary["abs_rel"] == 0
 
 
 def test_pixels_without_an_estimate_are_not_compared() -> None:
@@ -56,7 +54,7 @@ def test_pixels_without_an_estimate_are_not_compared() -> None:
     errors = DepthErrors()
     errors.add(depth, truth, sigma)
     summary = errors.metrics().tree()
-    assert summary is not None and summary["abs_rel"] == pytest.approx(0.1, rel=1e-5)
+    assert summary["abs_rel"] == pytest.approx(0.1, rel=1e-5)
     assert (summary["coverage"]["50"], summary["coverage"]["90"]) == (0.0, 1.0)
     nothing = DepthErrors()
     nothing.add(np.zeros((4, 4), np.float32), truth)
@@ -67,7 +65,7 @@ def test_an_estimate_beyond_the_range_counts_as_its_end() -> None:
     errors = DepthErrors()
     errors.add(np.full_like(TRUTH, 4000.0), np.full_like(TRUTH, 64.0))
     summary = errors.metrics().tree()
-    assert summary is not None and summary["abs_rel"] == pytest.approx(0.25)
+    assert summary["abs_rel"] == pytest.approx(0.25)
 
 
 def test_of_a_long_drive_evenly_spread_frames_are_held() -> None:
@@ -75,5 +73,5 @@ def test_of_a_long_drive_evenly_spread_frames_are_held() -> None:
     for k in range(3001):
         errors.add(TRUTH * (1 + k / 3000), TRUTH)
     summary = errors.metrics().tree()
-    assert summary is not None and 250 <= summary["frames"] <= 500
+    assert 250 <= summary["frames"] <= 500
     assert summary["abs_rel"] == pytest.approx(0.5, abs=0.01)

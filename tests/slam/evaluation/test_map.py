@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.evaluation.map import PlacedMetrics, compare, placed_metrics, pose_similarity
+from slam.evaluation.map import PlacedMetrics, compare, double_wall_share, placed_metrics, pose_similarity
 from slam.evaluation.surface import Indices, Mask, Surface, accumulated, backprojected, stretches
 from slam.frames import Intrinsics
 from slam.geometry import se3
@@ -167,6 +167,9 @@ def test_similarity_undoes_one() -> None:
     back = pose_similarity(truth, moved.apply_to_poses(truth))
     assert back.scale == pytest.approx(5.0)
     np.testing.assert_allclose(back.apply_to_poses(moved.apply_to_poses(truth)), truth, atol=1e-9)
+    rigid = pose_similarity(truth, moved.apply_to_poses(truth), with_scale=False)
+    assert rigid.scale == 1.0
+    np.testing.assert_allclose(rigid.R_a_b, moved.R_a_b.T, atol=1e-9)
 
 
 def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
@@ -179,16 +182,25 @@ def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
     assert roll < np.deg2rad(0.3)
 
 
-def test_a_rigid_motion_keeps_the_scale() -> None:
-    truth = drive()
-    moved = se3.Similarity(0.5, se3.from_rotation_vector(np.array([0.3, -1.0, 0.2]), np.zeros(3))[:3, :3], np.ones(3))
-    back = pose_similarity(truth, moved.apply_to_poses(truth), with_scale=False)
-    assert back.scale == 1.0
-    np.testing.assert_allclose(back.R_a_b, moved.R_a_b.T, atol=1e-9)
-
-
 def test_positions_of_a_long_drive_outweigh_a_constant_error_of_its_orientations() -> None:
     truth = straight(200)
     tilted = truth.copy()
     tilted[:, :3, :3] = se3.from_rotation_vector(np.array([np.deg2rad(1.0), 0.0, 0.0]), np.zeros(3))[:3, :3]
     assert se3.rotation_angle(pose_similarity(truth, tilted, with_scale=False).R_a_b) < np.deg2rad(0.1)
+
+
+SQUARE = np.array([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], float)
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])  # looks along z
+
+
+@pytest.mark.parametrize(("distance", "share"), [(0.1, 0.0), (1.0, 0.5), (1.9, 0.5), (2.5, 0.0)])
+def test_the_surface_behind_another_counts(distance: float, share: float):
+    vertices = np.concatenate([SQUARE, SQUARE + np.array([0, 0, distance])])
+    assert double_wall_share([(vertices, np.concatenate([TRIANGLES, TRIANGLES + 4]))]) == pytest.approx(share)
+
+
+def test_the_two_sides_of_a_body_are_not_a_double_wall():
+    vertices = np.concatenate([SQUARE, SQUARE - np.array([0, 0, 1.0])])
+    back = TRIANGLES[:, ::-1] + 4
+    assert double_wall_share([(vertices, np.concatenate([TRIANGLES, back]))]) == 0
+    assert np.isnan(double_wall_share([]))

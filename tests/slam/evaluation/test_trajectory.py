@@ -227,16 +227,6 @@ def test_golden_numbers(golden: dict[str, Any], sequence: str, alignment: str, e
     assert golden[sequence]["evo"]["difference"] < 1e-6
 
 
-@pytest.mark.data
-@pytest.mark.parametrize(
-    ("sequence", "expected"), [("09", (0.0142, 0.0077, 0.0007, 1587)), ("10", (0.0120, 0.0086, 0.0008, 1197))]
-)
-def test_golden_snippets(golden: dict[str, Any], sequence: str, expected: tuple[float, ...]) -> None:
-    snippets = golden[sequence]["snippet5"]
-    found = [round(snippets[key], 4) for key in ("ate_mean", "ate_std", "re_mean", "count")]
-    assert tuple(found) == expected
-
-
 @pytest.fixture(scope="module")
 def golden(data_root: Path) -> dict[str, Any]:
     """T of the public trajectories of sequences 09 and 10."""

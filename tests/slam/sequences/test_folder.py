@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 import yaml
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.numbering import by_name
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.images import ImageFiles
 
 
 @pytest.mark.parametrize(
@@ -122,3 +126,15 @@ def test_a_camera_of_another_size_scaled_as_advised(tmp_path: Path, images, came
         open_sequence(tmp_path)
     path.write_text(yaml.safe_dump(keys | yaml.safe_load("{" + str(caught.value).rpartition("{")[2])))
     assert open_sequence(tmp_path).intrinsics.fx == pytest.approx(keys["fx"] / 2)
+
+
+def test_the_first_readable_image_gives_the_size_and_another_is_named(tmp_path: Path, images) -> None:
+    images(tmp_path, ["0.png", "1.png", "3.png"])
+    images(tmp_path, ["2.png"], width=41)
+    (tmp_path / "0.png").write_bytes(b"")
+    files = ImageFiles(by_name(list_images(tmp_path)))
+    assert (files.width, files.height, len(files)) == (40, 24, 4) and files.read(1)[0, 0, 0] == 10
+    with pytest.raises(DataError, match=r"0\.png is empty"):
+        files.read(0)
+    with pytest.raises(SequenceError, match=r"2\.png is 41x24, but 1\.png is 40x24"):
+        files.read(2)

@@ -43,7 +43,9 @@ def read_split_file(name_or_path: str) -> Split:
     """Read a shipped split by its name, or a file."""
     path = Path(name_or_path)
     if not path.is_file():
-        shipped = {file.stem: file for folder in _folders() for file in sorted(folder.glob("*.yaml"))}
+        wheel, source = config_folders()  # beside the named configurations
+        folders = wheel / "splits", source.parent / "splits"
+        shipped = {file.stem: file for folder in folders for file in sorted(folder.glob("*.yaml"))}
         if name_or_path not in shipped:
             raise DataError(f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}")
         path = shipped[name_or_path]
@@ -55,21 +57,13 @@ def read_split_file(name_or_path: str) -> Split:
         raise DataError(f"{path} is no split of train, validation and test: {first_problem(error)}") from error
 
 
-def _folders() -> list[Path]:
-    """Beside the named configurations: in the wheel, or in the source tree."""
-    wheel, source = config_folders()
-    return [wheel / "splits", source.parent / "splits"]
-
-
 def _frames(name: str) -> list[tuple[str, int]]:
     match = _FRAMES.fullmatch(name.strip())
     runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
     if match is None or None in runs:
         raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
-    numbers = [
-        number
-        for run in runs
-        if run is not None
-        for number in range(int(run["first"]), int(run["stop"] or int(run["first"]) + 1), int(run["step"] or 1))
-    ]
+    numbers: list[int] = []
+    for run in filter(None, runs):
+        first = int(run["first"])
+        numbers += range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
     return [(match["recording"], number) for number in numbers]

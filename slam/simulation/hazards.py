@@ -79,30 +79,31 @@ class Traffic:
     def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
         rng = np.random.default_rng([seed, 33])
         self._route = drive
-        self._starts: list[tuple[float, float, float]] = []  # offset in lane samples, per frame, side in metres
+        # offset in lane samples, per frame, to the left in metres, along the lane or against it
+        self._courses: list[tuple[float, float, float, float]] = []
         meets = float(rng.uniform(4.0, 15.0))
         while meets < len(drive.sample):
             speed = -float(rng.uniform(0.7, 1.2)) / STEP
             start = float(drive.sample[int(meets)]) - speed * meets
-            self._starts.append((start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3))))
+            self._courses.append((start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3)), -1.0))
             meets += float(rng.uniform(12.0, 40.0))
-        self._passing = self._plan_passing(np.random.default_rng([seed, 34])) if overtaking else []
+        if overtaking:
+            self._courses += self._plan_passing(np.random.default_rng([seed, 34]))
         self._gap = float(rng.uniform(9.0, 14.0)) / STEP
         self._leader_leaves = float(rng.uniform(0.4, 0.8)) * len(drive.sample)
-        count = 1 + len(self._starts) + len(self._passing)
-        self._cars = Moving(rng, [lambda soup: car(soup, rng, frame_at(0.0, 0.0, 0.0))] * count)
+        makers = [lambda soup: car(soup, rng, frame_at(0.0, 0.0, 0.0))] * (1 + len(self._courses))
+        self._cars = Moving(rng, makers)
 
-    def _plan_passing(self, rng: np.random.Generator) -> list[tuple[float, float, float]]:
-        """Cars on the camera's left, and slower ones on its right, in the form of ``_starts``."""
+    def _plan_passing(self, rng: np.random.Generator) -> list[tuple[float, float, float, float]]:
+        """Courses of cars on the camera's left, and of slower ones on its right."""
         passing = []
         for _ in range(max(1, len(self._route.sample) // 12)):
             beside = int(rng.integers(len(self._route.sample)))
             left = rng.random() < 0.75
             speed = float(rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
-            side = min(self._route.lane_offset_m, WIDEST_LANE_M) * float(
-                rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9)
-            )
-            passing.append((float(self._route.sample[beside]) - speed * beside, speed, side))
+            lanes = float(rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9))
+            left_m = min(self._route.lane_offset_m, WIDEST_LANE_M) * lanes
+            passing.append((float(self._route.sample[beside]) - speed * beside, speed, left_m, 1.0))
         return passing
 
     def placed(self, index: int) -> list[Mesh]:
@@ -111,16 +112,11 @@ class Traffic:
         # the one in the camera's lane keeps its distance, until it drives away
         faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
         T_street_cars = [self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)]
-        T_street_cars += [self._at(start + speed * index, left_m, -1.0) for start, speed, left_m in self._starts]
-        T_street_cars += [self._at(start + speed * index, left_m, 1.0) for start, speed, left_m in self._passing]
-        near = {}
-        for number, T_street_car in enumerate(T_street_cars):
-            if T_street_car is None:
-                continue
-            distance = float(np.linalg.norm(T_street_car[:3, 3] - camera))
-            if 2.6 < distance < 120.0:  # nearer only where the drive crosses itself
-                near[number] = T_street_car
-        return self._cars.placed(near)
+        T_street_cars += [self._at(start + speed * index, left_m, way) for start, speed, left_m, way in self._courses]
+        there = {number: T_street_car for number, T_street_car in enumerate(T_street_cars) if T_street_car is not None}
+        away = {number: np.linalg.norm(T_street_car[:3, 3] - camera) for number, T_street_car in there.items()}
+        # nearer only where the drive crosses itself
+        return self._cars.placed({number: there[number] for number in there if 2.6 < away[number] < 120.0})
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""

@@ -39,11 +39,6 @@ class SimulatedRooms(SimulatedWorld):
         if options.frames < 2:
             raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
         house, self._interior = _furnished_house(options.seed)
-        self._lights = self._interior.lights.copy()
-        if "exposure" in options.hazards:  # some rooms are dim
-            strength = np.exp(np.random.default_rng([options.seed, 54]).uniform(-1.5, 0.5, len(house.rooms)))
-            for room, factor in zip(house.rooms, strength):
-                self._lights[room.contains(self._lights[:, :2]), 3] *= factor
         floor = Floor(house, self._interior.obstacles, options.seed)
         seconds = options.frames / options.rate + _AHEAD_S + 1.0
         motions = _PEOPLE if "people" in options.hazards else 1
@@ -63,7 +58,7 @@ class SimulatedRooms(SimulatedWorld):
 
     @functools.cached_property
     def _irradiance(self) -> Float32Array:
-        return illuminate(self._still, self._lights)
+        return _illuminated(self.options.seed, "exposure" in self.options.hazards)
 
     def _moments(self, seconds: FloatArray, options: SimulationOptions) -> FloatArray:
         """Where in the motion the camera is at times ``(N,)``: it is put down in the middle, if wanted."""
@@ -165,6 +160,18 @@ def _furnished_house(seed: int) -> tuple[House, Interior]:
     """A house, which several motions and hazards share."""
     house = draw_house(seed)
     return house, furnish(house, seed)
+
+
+@functools.lru_cache(maxsize=2)
+def _illuminated(seed: int, some_are_dim: bool) -> Float32Array:
+    """Irradiance in a house, some rooms of which may be dim."""
+    house, interior = _furnished_house(seed)
+    lights = interior.lights.copy()
+    if some_are_dim:
+        strength = np.exp(np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(house.rooms)))
+        for room, factor in zip(house.rooms, strength):
+            lights[room.contains(lights[:, :2]), 3] *= factor
+    return illuminate(Surface.of(interior.mesh), lights)
 
 
 def _standing(walk: Carried, seconds: float) -> FloatArray:

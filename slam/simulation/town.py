@@ -267,25 +267,23 @@ class _Town:
 
     def _lot(self, lot: Rectangle, facing: list[int]) -> None:
         """Build on a lot, or leave it open; ``facing`` lists the sides at a street (south, east, north, west)."""
-        rng, (x0, y0, x1, y1), corners = self.rng, lot, _corners(lot)
+        rng, (x0, y0, x1, y1) = self.rng, lot
         if min(x1 - x0, y1 - y0) > 5.0 and rng.random() < (self.density if facing else 0.3):
             side = facing[0] if facing else 0
             front = float(rng.uniform(0.0, 3.0)) if facing else 1.0
             gap = float(rng.choice([0.02, rng.uniform(0.4, 1.6)]))
             width, depth = (x1 - x0, y1 - y0) if side % 2 == 0 else (y1 - y0, x1 - x0)
-            frame = objects.frame_at(*corners[side], side * np.pi / 2.0, self.foot)
+            frame = _side(lot, side, self.foot)
             frame[3] += gap * frame[0] + front * frame[1]
             deep = min(depth - front - 0.2, float(rng.uniform(7.0, 14.0)))
             objects.building(self.soup, rng, frame, width - 2 * gap, deep)
             if front > 1.4 and rng.random() < 0.5:
-                frame = objects.frame_at(*corners[side], side * np.pi / 2.0, KERB - 0.05)
-                objects.hedge(self.soup, rng, frame, 0.6 * width)
+                objects.hedge(self.soup, rng, _side(lot, side, KERB - 0.05), 0.6 * width)
             return
         for side in facing:
             if rng.random() < 0.6:
-                length = x1 - x0 if side % 2 == 0 else y1 - y0
-                frame = objects.frame_at(*corners[side], side * np.pi / 2.0, KERB - 0.05)
-                objects.hedge(self.soup, rng, frame, length * float(rng.uniform(0.5, 1.0)))
+                length = (x1 - x0 if side % 2 == 0 else y1 - y0) * float(rng.uniform(0.5, 1.0))
+                objects.hedge(self.soup, rng, _side(lot, side, KERB - 0.05), length)
         for _ in range(int(rng.poisson(3.0 * self.greenery))):
             x, y = rng.uniform(x0 + 1.5, x1 - 1.5), rng.uniform(y0 + 1.5, y1 - 1.5)
             objects.tree(self.soup, rng, float(x), float(y), float(rng.uniform(4.0, 10.0)))
@@ -309,6 +307,12 @@ def _corners(rectangle: Rectangle) -> FloatArray:
     """South west, south east, north east and north west, ``(4, 2)``."""
     x0, y0, x1, y1 = rectangle
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def _side(rectangle: Rectangle, number: int, z: float) -> FloatArray:
+    """Frame along a side, counterclockwise from the south."""
+    x, y = _corners(rectangle)[number]
+    return objects.frame_at(x, y, number * np.pi / 2.0, z)
 
 
 def _directed(start: FloatArray, end: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:

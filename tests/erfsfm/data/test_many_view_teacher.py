@@ -21,13 +21,13 @@ SIZE = (64, 208)
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     root = tmp_path_factory.mktemp("world")
-    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 28, 704, 312, 96)), root / "world", depth=True)
+    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 20, 704, 312, 96)), root / "world", depth=True)
     return discover(root / "world")[0]
 
 
 @pytest.fixture(scope="module")
 def teacher(recording, tmp_path_factory) -> ManyViewTeacher:
-    teacher = ManyViewTeacher(tmp_path_factory.mktemp("teacher"), SIZE, stride=12)
+    teacher = ManyViewTeacher(tmp_path_factory.mktemp("teacher"), SIZE, stride=8)
     told = []
     teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
     assert told[0] == ("teacher: poses", 0, 1) and told[-1] == ("teacher: depth", 2, 2)
@@ -37,7 +37,7 @@ def teacher(recording, tmp_path_factory) -> ManyViewTeacher:
 def test_motion_is_in_camera_heights(recording, teacher):
     true = recording.true_poses()
     estimate = teacher.drive(recording).T_world_camera
-    assert estimate.shape == (28, 4, 4)
+    assert estimate.shape == (20, 4, 4)
     length_m = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
     length = np.linalg.norm(np.diff(estimate[:, :3, 3], axis=0), axis=1).sum()
     assert length_m / length == pytest.approx(1.65, rel=0.1)
@@ -45,11 +45,11 @@ def test_motion_is_in_camera_heights(recording, teacher):
 
 def test_a_snippet_has_its_motion_and_its_targets_bounds(recording, teacher):
     drive = teacher.drive(recording)
-    assert list(drive.targets(4)) == [12, 24]
-    seen = teacher.structure(recording, first=10, sources=4)
+    assert list(drive.targets(4)) == [8, 16]
+    seen = teacher.structure(recording, first=6, sources=4)
     assert seen.least.shape == seen.most.shape == SIZE
     true = recording.true_poses()
-    expected = np.linalg.inv(true[[10, 11, 13, 14]]) @ true[12]
+    expected = np.linalg.inv(true[[6, 7, 9, 10]]) @ true[8]
     got = seen.T_source_target.copy()
     got[:, :3, 3] *= 1.65
     np.testing.assert_allclose(got, expected, atol=0.25)
@@ -59,7 +59,7 @@ def test_a_snippet_has_its_motion_and_its_targets_bounds(recording, teacher):
 
 def test_what_was_measured_is_kept_and_what_was_lost_is_measured_again(recording, teacher):
     drive = teacher.drive(recording)
-    kept, lost = drive.label_file(24), drive.label_file(12)
+    kept, lost = drive.label_file(16), drive.label_file(8)
     before, written = lost.read_bytes(), kept.stat().st_mtime_ns
     lost.unlink()
     told = []
@@ -114,7 +114,7 @@ def test_learned_depth_is_refined_around_a_frame_at_the_size_of_the_labels(recor
 
 
 def test_poses_by_other_weights_are_refused(recording, teacher):
-    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:28\] by the weights 'sim', and .* 'default'"):
+    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:20\] by the weights 'sim', and .* 'default'"):
         teacher.prepare([recording], 4, "default", lambda *_: None)
 
 

@@ -6,7 +6,7 @@ import pytest
 from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.evaluation.many_view_truth import many_view_protocol
+from erfsfm.evaluation.many_view_truth import TRUTH_FOLDER, many_view_protocol
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
@@ -52,7 +52,7 @@ def cache(world, tmp_path_factory):
     folder, recording = tmp_path_factory.mktemp("cache"), discover(world)[0]
     T_world_camera = recording.true_poses().copy()
     T_world_camera[:, :3, 3] /= HEIGHT_M
-    ManyViewTeacher(folder, (128, 416), EVERY).drive(recording).keep_poses(T_world_camera)
+    ManyViewTeacher(folder / TRUTH_FOLDER, (128, 416), EVERY).drive(recording).keep_poses(T_world_camera)
     return folder
 
 

@@ -15,7 +15,7 @@ from erfsfm.common.errors import ConfigError
 
 TOOLS = Path(__file__).parents[3] / "tools"
 SMALL = ["network.depth_width=0.0625", "network.pose_width=0.125", "network.height=32", "network.width=64"]
-SHORT = ["training.steps=6", "training.checkpoint_every=2", "training.validate_every=2", "data.workers=0"]
+SHORT = ["training.steps=2", "training.checkpoint_every=2", "training.validate_every=2", "data.workers=0"]
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_tables_of_a_small_fake(
     words = ["--kitti", str(kitti), "--rows", row, "--output", str(output), "--device", "cpu", "--set", *SMALL, *SHORT]
     tool["main"](words)
     said = capsys.readouterr()
-    assert "6 steps of" in said.err and "all trainings: " in said.err
+    assert "2 steps of" in said.err and "all trainings: " in said.err
     assert "paper" in said.out and "- | - | - | -" in said.out, "no depth without --raw"
     weights = (output / row / "model.yaml").read_bytes()
     tool["main"]([*words[:-1], "data.workers=0", "--raw", str(raw), "--split", str(split)])

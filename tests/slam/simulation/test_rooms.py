@@ -58,7 +58,7 @@ def test_depth_is_the_distance_to_the_surface_and_closes_the_room(walk: Simulate
 def test_camera_keeps_clear_of_walls_and_furniture_and_turns_no_faster_than_asked(motion: Motion) -> None:
     world = rooms(600, 2, motion=motion, rate=5.0)
     step = np.linalg.norm(np.diff(world.T_world_camera[:, :3, 3], axis=0), axis=1)
-    assert world.distance_to_surface(world.T_world_camera[:, :3, 3])[::3].min() >= 0.3
+    assert world.distance_to_surface(world.T_world_camera[::3, :3, 3]).min() >= 0.3
     assert step.sum() > 20.0 and step.max() < 0.4
     assert turns_deg(world).max() < 1.5 * FASTEST_TURN_DEG
     assert se3.is_se3(world.T_world_camera, 1e-9) and np.array_equal(world.T_world_camera[0], np.eye(4))
@@ -87,16 +87,14 @@ def test_hazards_change_images_but_not_poses(walk: SimulatedRooms, hazard: str) 
 
 def test_people_have_depth() -> None:
     empty, peopled = rooms(300, 2), rooms(300, 2, hazards=("people",))
-    nearer = [
-        ((peopled.depth(k) < empty.depth(k) - 0.05).mean(), (peopled.depth(k) > empty.depth(k)).any())
-        for k in range(0, 300, 12)
-    ]
-    assert max(share for share, _ in nearer) > 0.01 and not any(farther for _, farther in nearer)
+    depths = [(peopled.depth(k), empty.depth(k)) for k in range(0, 300, 12)]
+    assert max((with_people < without - 0.05).mean() for with_people, without in depths) > 0.01
+    assert not any((with_people > without).any() for with_people, without in depths)
 
 
 def test_exposure_follows_the_light() -> None:
     world = rooms(300, 4, hazards=("exposure",))
-    brightness = [world.render(k).image.mean() for k in range(0, 300, 30)]
+    brightness = [world.render(k).image.mean() for k in range(0, 300, 60)]
     assert np.median(brightness) == pytest.approx(0.4 * 255, rel=0.4)
     assert np.ptp([world._gain(k) for k in range(0, 300, 30)]) > 0.1
 

@@ -49,7 +49,7 @@ def test_a_camera_keeps_its_field_of_view_when_its_image_is_shrunk() -> None:
 
 def test_sunny_streets_saturate_a_little_and_shadows_are_deep() -> None:
     shares, steepest = [], 0.0
-    for seed in range(700, 709):
+    for seed in range(700, 706):
         street = SimulatedStreet(SimulationOptions("straight", 30, seed, 104, 32, varied=True))
         weather = street._weather
         if weather.saturated >= 0.04:
@@ -57,7 +57,7 @@ def test_sunny_streets_saturate_a_little_and_shadows_are_deep() -> None:
             assert 3.0 <= road_in_sun / weather.ambient <= 10.0 + 1e-6
             shares.append(np.mean([(street.render(index).image.max(axis=2) >= 254).mean() for index in (0, 15, 29)]))
         steepest = max(steepest, np.abs(np.diff(street.T_world_camera[:, 1, 3])).max())
-    assert len(shares) >= 4 and 0.02 < np.mean(shares) < 0.15
+    assert len(shares) >= 3 and 0.02 < np.mean(shares) < 0.15
     assert steepest > 0.03
 
 

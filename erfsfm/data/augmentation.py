@@ -50,14 +50,9 @@ def augment(
 def rolled(
     image: NDArray[np.uint8], maps: Maps, camera: Camera, angle: float, unknown: Sequence[float]
 ) -> tuple[NDArray[np.uint8], Maps]:
-    """The image ``(H, W, 3)`` and maps of the camera turned about its optical axis, which leaves z-depth as it is.
+    """The image ``(H, W, 3)`` and maps ``(H, W)`` of a camera turned about its optical axis by an angle in radians.
 
-    Args:
-        image: of the camera.
-        maps: ``(H, W)`` each.
-        camera: of them.
-        angle: radians.
-        unknown: value of each map beyond the image's edges, where the image is mirrored.
+    Z-depth stays as it is. Each map has its ``unknown`` value beyond the image's edges, where the image is mirrored.
     """
     K = camera.K.astype(np.float64)
     cos, sin = np.cos(angle), np.sin(angle)

@@ -44,9 +44,8 @@ def training_sample(
     images, bounds, varied, mirrored = augment(images, bounds, camera, config.data, config.network.fidelity, rng)
     sample = as_tensors(images, varied.K)
     if seen is not None:
-        T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
-        nearer = _nearer(varied, config)
-        T_source_target = T_source_target.copy()
+        mirror, nearer = np.diag([-1 if mirrored else 1, 1, 1, 1]).astype(np.float32), _nearer(varied, config)
+        T_source_target = mirror @ seen.T_source_target @ mirror
         T_source_target[:, :3, 3] /= nearer
         sample["T_source_target"] = torch.from_numpy(T_source_target)
         sample |= _bounds(bounds, nearer)
@@ -112,9 +111,3 @@ def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
 def in_unit_range(batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """The tensors of a batch with colour in [0, 1]; samples hold it as uint8, a quarter of the bytes to hand over."""
     return {name: each.float() / 255 if each.dtype == torch.uint8 else each for name, each in batch.items()}
-
-
-def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The motion ``(..., 4, 4)`` of horizontally flipped images."""
-    mirror = np.diag([-1, 1, 1, 1]).astype(np.float32)
-    return np.asarray(mirror @ T_a_b @ mirror, dtype=np.float32)

@@ -108,15 +108,8 @@ def refined_label(
 ) -> tuple[Array, Array]:
     """Least and most inverse depth of each pixel ``(H, W)``, in one over camera heights; 0 and infinite if unknown.
 
-    The shipped fusion network decides between the learned depth and what the neighbours measure, and how sure it is.
-    The sky is bounded from above.
-
-    Args:
-        target: grey image ``(H, W)``.
-        neighbours: N images of the same camera.
-        K: camera matrix of these images.
-        T_neighbour_target: ``(N, 4, 4)``, translations in camera heights.
-        learned: inverse depth ``(H, W)`` by a network, in one over camera heights.
+    The shipped fusion network decides between the ``learned`` inverse depth ``(H, W)``, in one over camera heights, and
+    what the neighbours measure, and how sure it is. The sky is bounded from above. Else as `label`.
     """
     others = [Appearance.of(each) for each in neighbours]
     image, depth = Appearance.of(target), np.asarray(1 / learned, np.float32)

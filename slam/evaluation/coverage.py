@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
 from slam.frames import RelativePose
@@ -37,9 +36,10 @@ def coverage(
         bounds = np.array([squared_bound(level / 100, dof) for dof in dofs])
         inside[str(level)] = squared <= bounds[dof_of_factor]  # (F,)
     sources = np.array([edge.source for edge in relative_poses])
-    found = {"": _ratios(inside, np.ones(len(sources), dtype=bool))}
+    found = {"": {level: float(within.mean()) for level, within in inside.items()}}
     for source in np.unique(sources):
-        found[str(source)] = {"factors": int((sources == source).sum()), **_ratios(inside, sources == source)}
+        ratios = {level: float(within[sources == source].mean()) for level, within in inside.items()}
+        found[str(source)] = {"factors": int((sources == source).sum()), **ratios}
     return found
 
 
@@ -52,7 +52,3 @@ def squared_bound(probability: float, student_t_dof: float) -> float:
     if math.isinf(student_t_dof):
         return float(chdtri(6, 1.0 - probability))
     return float(6 * (student_t_dof - 2) / student_t_dof * fdtri(6, student_t_dof, probability))
-
-
-def _ratios(inside: Mapping[str, NDArray[np.bool_]], chosen: NDArray[np.bool_]) -> dict[str, float]:
-    return {level: float(within[chosen].mean()) for level, within in inside.items()}

@@ -219,25 +219,19 @@ def _surface_along(
     samples = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]
     away, camera = cameras.query(samples, distance_upper_bound=RANGE_M)
     own = np.flatnonzero(np.isfinite(away) & np.isin(camera, stretch))
-    return truth.distance or _distance_to(surface.points), samples[own], away[own]
-
-
-def _distance_to(surface: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """The function from points ``(P, 3)`` to their distances ``(P,)`` to surface points ``(S, 3)``."""
-    tree = cKDTree(surface, leafsize=_LEAF_POINTS)
-    return lambda points: np.asarray(tree.query(points)[0])
+    if truth.distance is not None:
+        return truth.distance, samples[own], away[own]
+    tree = cKDTree(surface.points, leafsize=_LEAF_POINTS)
+    return lambda points: np.asarray(tree.query(points)[0]), samples[own], away[own]
 
 
 def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:
     """Distances from samples ``(S, 3)`` of the surface to the map ``(P, 3)``; infinite beyond 1 m."""
-    if len(samples) == 0 or len(points) == 0:
-        return np.full(len(samples), np.inf)
+    if len(samples) == 0:
+        return np.empty(0)
     low, high = samples.min(axis=0) - OUTLIER_M, samples.max(axis=0) + OUTLIER_M
     near = points[((points >= low) & (points <= high)).all(axis=1)]
-    if len(near) == 0:
-        return np.full(len(samples), np.inf)
-    distances: FloatArray = cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0]
-    return distances
+    return np.asarray(cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0])
 
 
 def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) -> float:

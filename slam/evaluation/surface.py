@@ -113,13 +113,9 @@ def accumulated(truth: SurfaceTruth, views: Indices, positions: FloatArray) -> S
 
 
 def backprojected(depth_m: FloatArray, rays: FloatArray, T_world_camera: FloatArray, range_m: float) -> FloatArray:
-    """Points ``(P, 3)`` in the world of a depth map ``(H, W)``, no further than ``range_m`` from the camera.
+    """Points ``(P, 3)`` in the world of z-depth ``(H, W)``, no further than ``range_m`` from the camera.
 
-    Args:
-        depth_m: z-depth, 0 or not finite where unknown.
-        rays: through every pixel, z = 1, ``(H, W, 3)``.
-        T_world_camera: ``(4, 4)``.
-        range_m: largest distance from the camera.
+    Depth is 0 or not finite where unknown; ``rays`` ``(H, W, 3)`` go through every pixel, z = 1.
     """
     known = np.isfinite(depth_m) & (depth_m > 0)
     points = rays[known] * depth_m[known][:, None]

@@ -20,6 +20,7 @@ from slam.frames import Image
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
+from slam.sequences.images import ReadImages
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near, poses_of
 from slam.sequences.recording import ArrayReader, RecordedSequence, Source
@@ -100,31 +101,23 @@ class StampedMessages:
         return ros.points_of(self.read(index), where)
 
 
-class BagImages:
-    """The images of a topic, all of the size of the first readable ones. Not for use from several threads."""
+def images_of(messages: StampedMessages, where: str) -> ReadImages:
+    """The images of a topic, all of the size of the first readable ones; not for use from several threads."""
+    rows = range(len(messages))
+    stretch = stretch_of(rows, lambda row: ros.values_of(messages.read(row), where))
 
-    def __init__(self, bag: Bag, topic: str) -> None:
-        """Read the stamps of all and the first readable images for their size."""
-        self.messages = StampedMessages(bag, topic)
-        self._where = f"an image of {topic} in {bag.path}"
-        rows = range(len(self))
-        self._stretch = stretch_of(rows, lambda index: ros.values_of(self.messages.read(index), self._where))
-        self.height, self.width = first_usual(rows[:_SOUGHT_IMAGES], self._decode)[1].shape[:2]
+    def decode(row: int) -> Image:
+        return ros.image_of(messages.read(row), where, stretch)
 
-    def __len__(self) -> int:
-        """Number of images."""
-        return len(self.messages)
+    height, width = first_usual(rows[:_SOUGHT_IMAGES], decode)[1].shape[:2]
 
-    def read(self, index: int) -> Image:
-        """One image ``(height, width, 3)`` uint8 RGB."""
-        image = self._decode(index)
-        height, width = image.shape[:2]
-        if (height, width) != (self.height, self.width):
-            raise SequenceError(f"{self._where} is {width}x{height}, the first are {self.width}x{self.height}")
+    def read(row: int) -> Image:
+        image = decode(row)
+        if image.shape[:2] != (height, width):
+            raise SequenceError(f"{where} is {image.shape[1]}x{image.shape[0]}, the first are {width}x{height}")
         return image
 
-    def _decode(self, index: int) -> Image:
-        return ros.image_of(self.messages.read(index), self._where, self._stretch)
+    return ReadImages(width, height, len(rows), read)
 
 
 Mounts = dict[str, tuple[str, FloatArray]]
@@ -133,9 +126,10 @@ Mounts = dict[str, tuple[str, FloatArray]]
 
 def transform_between(mounts: Mounts, a: str, b: str) -> FloatArray | None:
     """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
-    if not (frame_name(a) and frame_name(b)):
+    names = [frame.removeprefix("/") for frame in (a, b)]  # ROS 1 may write a slash
+    if not all(names):
         return None
-    (root_a, T_root_a), (root_b, T_root_b) = (_from_root(mounts, frame_name(frame)) for frame in (a, b))
+    (root_a, T_root_a), (root_b, T_root_b) = (_from_root(mounts, name) for name in names)
     return invert(T_root_a) @ T_root_b if root_a == root_b else None
 
 
@@ -171,13 +165,8 @@ def transforms(bag: Bag, topic: str) -> Iterator[tuple[str, str, float, FloatArr
             except ValueError as error:
                 logger.warning("%s: the transform of %r is left out: %s", topic, each.child_frame_id, error)
                 continue
-            frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
-            yield *frames, stamp.sec + 1e-9 * stamp.nanosec, T_parent_child
-
-
-def frame_name(text: str) -> str:
-    """The name of a frame; ROS 1 may write it with a slash."""
-    return text.removeprefix("/")
+            parent, child = (name.removeprefix("/") for name in (each.header.frame_id, each.child_frame_id))
+            yield parent, child, stamp.sec + 1e-9 * stamp.nanosec, T_parent_child
 
 
 def transform_of(message: Any) -> FloatArray:
@@ -191,8 +180,8 @@ def transform_of(message: Any) -> FloatArray:
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
     """Open the images of a topic with what the bag has beside: calibration, true poses, LiDAR scans."""
     bag = Bag(path)
-    stored = BagImages(bag, topic)
-    stamps = stored.messages.stamps
+    messages = StampedMessages(bag, topic)
+    stored, stamps = images_of(messages, f"an image of {topic} in {bag.path}"), messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     calibration = partial(_calibration, bag, topic, fps, (stored.width, stored.height))
     camera = find_camera_file(asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration)

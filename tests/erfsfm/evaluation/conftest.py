@@ -27,16 +27,8 @@ def points_at() -> Callable[..., NDArray[np.float32]]:
 
 @pytest.fixture
 def write_drive() -> Callable[..., Path]:
-    def write(
-        root: Path,
-        frames: int = 9,
-        size: tuple[int, int] = (64, 96),
-        stored: tuple[int, int] | None = None,
-        speed: float = 10.0,
-        points: NDArray[np.float32] | None = None,
-        suffix: str = ".png",
-    ) -> Path:
-        height, width = size
+    def write(root: Path, speed: float = 10.0, points: NDArray[np.float32] | None = None) -> Path:
+        height, width, frames = 64, 96, 9
         date, drive = root / "2011_09_26", root / "2011_09_26" / f"{DRIVE}_sync"
         for folder in ("image_02", "velodyne_points", "oxts"):
             (drive / folder / "data").mkdir(parents=True)
@@ -52,8 +44,8 @@ def write_drive() -> Callable[..., Path]:
         stamps = [f"2011-09-26 13:10:51.{100_000_000 * k:09d}" for k in range(frames)]
         (drive / "oxts" / "timestamps.txt").write_text("\n".join(stamps) + "\n")
         for k in range(frames):
-            image = np.full((*(stored or size), 3), 40 + 10 * k, np.uint8)
-            cv2.imwrite(str(drive / "image_02/data" / f"{k:010d}{suffix}"), image)
+            image = np.full((height, width, 3), 40 + 10 * k, np.uint8)
+            cv2.imwrite(str(drive / "image_02/data" / f"{k:010d}.png"), image)
             points.tofile(drive / "velodyne_points/data" / f"{k:010d}.bin")
             values = np.zeros(30)
             values[[6, 7, 10]] = [0.6 * speed, 0.8 * speed, 0]

@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slam.formats.colmap import Sightings, write_colmap
 from slam.frames import Intrinsics
@@ -30,9 +31,7 @@ def rows(path: Path) -> list[list[str]]:
 
 def lines_of(path: Path) -> list[list[float | str]]:
     """Its rows, numbers as numbers."""
-    return [
-        [float(word) if word[0] in "-0123456789" and "png" not in word else word for word in row] for row in rows(path)
-    ]
+    return [[word if word[0].isalpha() or "png" in word else float(word) for word in row] for row in rows(path)]
 
 
 def binary_rows(folder: Path) -> list[list[list[float | str]]]:
@@ -59,17 +58,6 @@ def binary_rows(folder: Path) -> list[list[list[float | str]]]:
     return found
 
 
-def rotation(qw: float, qx: float, qy: float, qz: float) -> FloatArray:
-    """The matrix of a unit quaternion, written out as COLMAP's documentation has it."""
-    return np.array(
-        [
-            [1 - 2 * (qy**2 + qz**2), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)],
-            [2 * (qx * qy + qw * qz), 1 - 2 * (qx**2 + qz**2), 2 * (qy * qz - qw * qx)],
-            [2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx**2 + qy**2)],
-        ]
-    )
-
-
 def test_a_model_reads_back(tmp_path: Path) -> None:
     pixels = np.array([[10.0, 20.0], [11.0, 21.0], [12.0, 22.0]])
     seen = Sightings(np.array([3, 0, 3]), pixels, np.array([1, 1, 0]), np.array([0.25, 0.75, 1.0]))
@@ -91,7 +79,7 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
     for k, (image_id, *pose, camera, name) in enumerate(images[::2]):
         assert (image_id, camera, name) == (str(k + 1), "1", f"{k:06d}.png")
         numbers = np.array(pose, dtype=float)
-        seen = points[:, 1:4] @ rotation(*numbers[:4]).T + numbers[4:]
+        seen = Rotation.from_quat(numbers[:4], scalar_first=True).apply(points[:, 1:4]) + numbers[4:]
         u, v = fx * seen[:, 0] / seen[:, 2] + cx, fy * seen[:, 1] / seen[:, 2] + cy
         ours = apply(invert(drive()[k]), POINTS) @ CAMERA.K.T
         # their pixel (0.5, 0.5) is our (0, 0)

@@ -133,7 +133,7 @@ class DriveLabels:
         """
         cv2.setNumThreads(1)
         for target in targets:
-            bounds = self._by_flow(target) if learned is None else self._refined(target, learned)
+            bounds = self._bounds(target, learned)
             if bounds is None:
                 bounds = np.zeros(self.size, np.float32), np.full(self.size, np.inf, np.float32)
             least, most = (
@@ -144,26 +144,22 @@ class DriveLabels:
             _write(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
         return len(targets)
 
-    def _by_flow(self, target: int) -> Bounds | None:
-        """Label of a frame at a size at which flow is fine."""
-        camera = self.recording.camera
-        ratio = min(LARGEST_WIDTH / camera.width, 1)
-        camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
+    def _bounds(self, target: int, learned: Learned | None) -> Bounds | None:
+        """Label of a frame by flow, at a size at which that is fine, or around its learned depth in finer images."""
+        camera, (height, width) = self.recording.camera, self.size
+        if learned is None:
+            ratio = min(LARGEST_WIDTH / camera.width, 1)
+            camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
+        else:
+            finer = FINER if camera.width > 1.5 * width else 1
+            camera = camera.resized(finer * width, finer * height)
         image, around = self._image(target, camera), self._around(target, camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
-        return label(_grey(image), [*around.values()], camera.K.astype(np.float64), self._motion(target, around))
-
-    def _refined(self, target: int, learned: Learned) -> Bounds | None:
-        """Label of a frame at the labels' size, around its learned depth, which is refined in finer images."""
-        finer = FINER if self.recording.camera.width > 1.5 * self.size[1] else 1
-        camera = self.recording.camera.resized(finer * self.size[1], finer * self.size[0])
-        image, around = self._image(target, camera), self._around(target, camera)
-        if image is None or len(around) < LEAST_NEIGHBOURS:
-            return None
-        grey, K = _grey(image), camera.K.astype(np.float64)
-        by_flow = measure(grey, [*around.values()], K, self._motion(target, around))
-        inverse_depth = in_camera_heights(learned(image), by_flow)
+        grey, K, motion = _grey(image), camera.K.astype(np.float64), self._motion(target, around)
+        if learned is None:
+            return label(grey, [*around.values()], K, motion)
+        inverse_depth = in_camera_heights(learned(image), measure(grey, [*around.values()], K, motion))
         if inverse_depth is None:
             return None
         frames = np.arange(len(self.recording))

@@ -27,8 +27,12 @@ _SMALL = (104, 32)  # columns, rows: coarse enough to average noise away
 
 def moving_parts(recording: Recording, shortest_stop: int = 1) -> list[Recording]:
     """The stretches of a recording between stops of that many frames, in order; all of it where it never stops."""
+    if recording.oxts is None:
+        still = _unchanged(recording)
+    else:
+        still = _speeds(recording.oxts, recording.start, len(recording)) < STILL_M_S
     moving = np.ones(len(recording), np.bool_)
-    for start, stop in _runs(_still(recording)):
+    for start, stop in _runs(still):
         moving[start:stop] = stop - start < shortest_stop
     return [recording.part(int(start), int(stop)) for start, stop in _runs(moving)]
 
@@ -36,13 +40,6 @@ def moving_parts(recording: Recording, shortest_stop: int = 1) -> list[Recording
 def _runs(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Starts and ends ``(K, 2)`` of the runs of chosen frames."""
     return np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-
-
-def _still(recording: Recording) -> NDArray[np.bool_]:
-    """Whether the car stands still, ``(N,)``."""
-    if recording.oxts is None:
-        return _unchanged(recording)
-    return _speeds(recording.oxts, recording.start, len(recording)) < STILL_M_S
 
 
 @lru_cache(maxsize=1)

@@ -154,14 +154,14 @@ def trajectory_metrics(
         return TrajectoryMetrics(snippet5=snippets, align=aligned, evo=EvoMetrics.unknown(reason))
     T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
     ours = {name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS}
-    cut = [snippets_from_trajectory(T, SNIPPET_LENGTH) for T in (T_world_estimate, T_world_reference)]
+    predicted, true = (snippets_from_trajectory(T, SNIPPET_LENGTH) for T in (T_world_estimate, T_world_reference))
     without_ate = None
     if _stands_still(T_world_reference):
         without_ate = _REFERENCE_STANDS_STILL
-    elif snippet5 is None and _goes_backwards(*cut):
+    elif snippet5 is None and _goes_backwards(predicted, true):
         without_ate = _BACKWARDS
-    if snippet5 is None and len(cut[0]):
-        snippet5 = snippet_errors(*cut)
+    if snippet5 is None and len(predicted):
+        snippet5 = snippet_errors(predicted, true)
     return TrajectoryMetrics(
         snippet5=_snippet_metrics(snippet5, without_ate),
         align=Alignments.of(**ours),

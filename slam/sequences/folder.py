@@ -39,13 +39,7 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
     stamps = _times_of_images([place / name for place in (where, folder) for name in TIMES], files, camera.fps)
     name = recording_name(folder)
-    return RecordedSequence(
-        name=name,
-        images=stored,
-        camera=camera,
-        stamps=stamps,
-        sources=(Source(f"folder/{name}"),),
-    )
+    return RecordedSequence(name, stored, camera, stamps, (Source(f"folder/{name}"),))
 
 
 def _times_of_images(places: list[Path], files: NumberedFiles, fps: float) -> FloatArray:
@@ -73,13 +67,8 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
     folder = path.absolute().parent
     frames = VideoFrames(path)
     camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps)
-    return RecordedSequence(
-        name=clip_name(path),
-        images=frames,
-        camera=camera,
-        stamps=_times_of_frames(path, frames, camera.fps),
-        sources=(Source(f"folder/{video_name(path)}"),),
-    )
+    stamps, sources = _times_of_frames(path, frames, camera.fps), (Source(f"folder/{video_name(path)}"),)
+    return RecordedSequence(clip_name(path), frames, camera, stamps, sources)
 
 
 def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
@@ -89,13 +78,11 @@ def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
     if rates and times_s is not None and len(times_s) > 1:
         rates.append(1.0 / float(np.median(np.diff(times_s))))  # missing frames lower the mean rate alone
     if rates and all(abs(rate / fps - 1) > _RATE_TOLERANCE for rate in rates):
-        logger.warning(
+        text = (
             "%s has %.4g frames a second, the camera has %g: taken as even at the camera's rate; correct fps, unless "
-            "the video plays faster or slower than it was taken",
-            path,
-            frames.fps,
-            fps,
+            "the video plays faster or slower than it was taken"
         )
+        logger.warning(text, path, frames.fps, fps)
         return even
     if times_s is None:
         return even

@@ -62,16 +62,16 @@ def _recorded(
     places: Sequence[Path],
     own: Callable[[], CameraFile] | None,
     first: int = 0,
-    **beside_images: Any,
+    **known: Any,
 ) -> RecordedSequence:
-    """A recording of image files, the ``first`` of them by the data set's own numbers.
+    """A recording of image files, the ``first`` of them by the data set's own numbers, with what is ``known`` beside.
 
     ``places`` may have a ``camera.yaml``; ``own`` reads the calibration of the data set.
     """
     stored = ImageFiles(files)
     camera = find_camera_file(asked, *places, wanted_by=f"{name} in {places[0]}", images=stored, own=own)
     sources = (Source(f"{data_set}/{name}", first=first),)
-    return RecordedSequence(name, stored, camera, stamps, sources, **beside_images)
+    return RecordedSequence(name, stored, camera, stamps, sources, **known)
 
 
 def _index(table: Path, folder: Path, in_nanoseconds: bool = False) -> tuple[FloatArray, list[Path]]:
@@ -240,18 +240,13 @@ def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     frames = [folder / f"frame-{k:06d}" for k in range(numbers[0], numbers[-1] + 1)]
     files = by_table([frame.with_suffix(".color.png") for frame in frames], folder)
     stamps = np.arange(numbers[0], numbers[-1] + 1) / _FPS
-    return _recorded(
-        "7scenes",
-        f"{folder.parent.name}_{folder.name}",
-        files,
-        stamps,
-        asked,
-        (folder, folder.parent),
-        lambda: CameraFile(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS),
-        numbers[0],
-        T_any_camera=pose_files([frame.with_suffix(".pose.txt") for frame in frames], stamps),
-        depth_maps=_depth_maps([frame.with_suffix(".depth.png") for frame in frames], _SEVEN_SCENES_UNKNOWN),
-    )
+    name, places = f"{folder.parent.name}_{folder.name}", (folder, folder.parent)
+    own = partial(CameraFile, width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS)
+    known = {
+        "T_any_camera": pose_files([frame.with_suffix(".pose.txt") for frame in frames], stamps),
+        "depth_maps": _depth_maps([frame.with_suffix(".depth.png") for frame in frames], _SEVEN_SCENES_UNKNOWN),
+    }
+    return _recorded("7scenes", name, files, stamps, asked, places, own, numbers[0], **known)
 
 
 # ScanNet as its reader exports it: {color/0.jpg,depth/0.png,pose/0.txt,intrinsic}
@@ -267,18 +262,12 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
     there = [int(path.stem) for path in files.paths]
     numbers = np.interp(np.arange(len(files)), files.rows, there).round().astype(int).tolist()
     stamps = np.array(numbers) / _FPS
-    return _recorded(
-        "scannet",
-        folder.name,
-        files,
-        stamps,
-        asked,
-        [folder],
-        partial(_scannet_camera, folder / _SCANNET_CAMERA, files),
-        numbers[0],
-        T_any_camera=pose_files([folder / "pose" / f"{k}.txt" for k in numbers], stamps),
-        depth_maps=_depth_maps([folder / "depth" / f"{k}.png" for k in numbers]),
-    )
+    own = partial(_scannet_camera, folder / _SCANNET_CAMERA, files)
+    known = {
+        "T_any_camera": pose_files([folder / "pose" / f"{k}.txt" for k in numbers], stamps),
+        "depth_maps": _depth_maps([folder / "depth" / f"{k}.png" for k in numbers]),
+    }
+    return _recorded("scannet", folder.name, files, stamps, asked, [folder], own, numbers[0], **known)
 
 
 _SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
@@ -317,19 +306,9 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
             scans = {k: partial(read_velodyne, path, 5) for k, path in paths.items() if path.exists()}
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise SequenceError(f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again") from error
-    return _recorded(
-        "nuscenes",
-        scene,
-        files,
-        stamps,
-        asked,
-        [root],
-        partial(camera_of, keys, str(tables / "calibrated_sensor.json")),
-        files.first,
-        T_any_camera=T_any_camera,
-        T_camera_lidar=T_camera_lidar,
-        scans=scans,
-    )
+    own = partial(camera_of, keys, str(tables / "calibrated_sensor.json"))
+    known = {"T_any_camera": T_any_camera, "T_camera_lidar": T_camera_lidar, "scans": scans}
+    return _recorded("nuscenes", scene, files, stamps, asked, [root], own, files.first, **known)
 
 
 def _scene(tables: Path, scene: str) -> tuple[dict[str, list[Row]], dict[str, Row], dict[str, Row]]:

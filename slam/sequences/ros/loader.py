@@ -187,16 +187,10 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     camera = find_camera_file(asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration)
     mounts: Mounts = {child: (parent, T) for parent, child, _, T in transforms(bag, _STATIC_TOPIC)}
     frame = bag.first(topic).header.frame_id
-    T_camera_lidar, scans = _scans(bag, mounts, frame, stamps)
+    truth, sources = _true_poses(bag, mounts, frame, stamps), (Source(f"bag/{name}"),)
+    extrinsics, scans = _scans(bag, mounts, frame, stamps)
     return RecordedSequence(
-        name=name,
-        images=stored,
-        camera=camera,
-        stamps=stamps,
-        sources=(Source(f"bag/{name}"),),
-        T_any_camera=_true_poses(bag, mounts, frame, stamps),
-        T_camera_lidar=T_camera_lidar,
-        scans=scans,
+        name, stored, camera, stamps, sources, T_any_camera=truth, T_camera_lidar=extrinsics, scans=scans
     )
 
 

@@ -79,7 +79,7 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
     for k, (image_id, *pose, camera, name) in enumerate(images[::2]):
         assert (image_id, camera, name) == (str(k + 1), "1", f"{k:06d}.png")
         numbers = np.array(pose, dtype=float)
-        seen = Rotation.from_quat(numbers[:4], scalar_first=True).apply(points[:, 1:4]) + numbers[4:]
+        seen = Rotation.from_quat(numbers[[1, 2, 3, 0]]).apply(points[:, 1:4]) + numbers[4:]
         u, v = fx * seen[:, 0] / seen[:, 2] + cx, fy * seen[:, 1] / seen[:, 2] + cy
         ours = apply(invert(drive()[k]), POINTS) @ CAMERA.K.T
         # their pixel (0.5, 0.5) is our (0, 0)

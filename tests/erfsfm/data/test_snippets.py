@@ -1,4 +1,4 @@
-"""Draws, windows, validation, and the split of recordings."""
+"""Draws, windows, validation, the split of recordings, and split files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
+from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.window import snippet_motion
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
@@ -312,3 +314,21 @@ def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(
     assert [each.frames_name for each in validation] == ["kitti_odometry/01[30:50]"]
     with pytest.raises(DataError, match=r"validation_share 0\.4 leaves fewer than 20 frames of .*/04 \(20 frames\)"):
         split_recordings(config.model_copy(update={"roots": [tmp_path / "short"]}))
+
+
+@pytest.mark.parametrize(("name", "count"), [("eigen", 61), ("odometry", 11)])
+def test_nothing_is_in_two_lists(name: str, count: int) -> None:
+    split = read_split_file(name)
+    assert split.train and split.validation
+    assert overlapping([*split.train, *split.validation], split.test_recordings) == []
+    assert overlapping(split.train, split.validation) == []
+    everything = [*split.train, *split.validation, *split.test_recordings]
+    assert len(set(everything)) == len(everything) == count
+
+
+@pytest.mark.parametrize(
+    ("runs", "frames"),
+    [("3", [3]), ("0:3", [0, 1, 2]), ("0:7:3", [0, 3, 6]), ("0:7:3, 9,11:13", [0, 3, 6, 9, 11, 12])],
+)
+def test_runs(runs: str, frames: list[int]) -> None:
+    assert Split(test=[f"kitti_raw/a[{runs}]"]).test_frames() == [("kitti_raw/a", frame) for frame in frames]

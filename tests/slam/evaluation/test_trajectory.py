@@ -212,28 +212,16 @@ def test_limits() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("sequence", "alignment", "expected"),
+    ("sequence", "six", "seven"),
     [
-        ("09", "6dof", [10.880, 2.607, 0.288, 0.056, 0.037]),
-        ("09", "7dof", [10.729, 2.528, 0.288, 0.054, 0.037]),
-        ("10", "6dof", [3.721, 2.293, 0.369, 0.047, 0.043]),
-        ("10", "7dof", [3.356, 2.221, 0.369, 0.047, 0.043]),
+        ("09", [10.880, 2.607, 0.288, 0.056, 0.037], [10.729, 2.528, 0.288, 0.054, 0.037]),
+        ("10", [3.721, 2.293, 0.369, 0.047, 0.043], [3.356, 2.221, 0.369, 0.047, 0.043]),
     ],
 )
-def test_golden_numbers(golden: dict[str, Any], sequence: str, alignment: str, expected: list[float]) -> None:
+def test_golden_numbers(data_root: Path, sequence: str, six: list[float], seven: list[float]) -> None:
     """DF-VO's stereo-trained trajectories, as kitti-odom-eval scores them, to every printed digit."""
-    record = golden[sequence]["align"][alignment]
-    assert [round(record[key], 3) for key in AlignedMetrics.names()[:5]] == expected
-    assert golden[sequence]["evo"]["difference"] < 1e-6
-
-
-@pytest.fixture(scope="module")
-def golden(data_root: Path) -> dict[str, Any]:
-    """T of the public trajectories of sequences 09 and 10."""
-    folder = data_root / "golden"
-    return {
-        name: metrics_of(
-            read_trajectory(folder / f"dfvo_stereo_{name}.txt"), read_trajectory(folder / f"reference_{name}.txt")
-        )
-        for name in ("09", "10")
-    }
+    files = (data_root / "golden" / f"{kind}_{sequence}.txt" for kind in ("dfvo_stereo", "reference"))
+    metrics = metrics_of(*map(read_trajectory, files))
+    for alignment, expected in (("6dof", six), ("7dof", seven)):
+        assert [round(metrics["align"][alignment][key], 3) for key in AlignedMetrics.names()[:5]] == expected
+    assert metrics["evo"]["difference"] < 1e-6

@@ -3,6 +3,8 @@ import pytest
 
 from slam.sequences.poses import rebased
 from slam.sequences.recording import Source, frame_range
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.options import SimulationOptions
 
 
 @pytest.mark.parametrize(
@@ -36,3 +38,32 @@ def test_rebased_is_rigid_and_starts_at_the_identity() -> None:
     result = rebased(T)
     assert np.array_equal(result[0], np.eye(4))
     assert result[2, :3, 3] == pytest.approx(T[2, :3, 3] - T[0, :3, 3], abs=1e-5)
+
+
+@pytest.fixture(scope="module")
+def simulated() -> SimulatedSequence:
+    return SimulatedSequence(SimulationOptions(route="straight", frames=20, seed=1001, width=104, height=32))
+
+
+def test_is_a_sequence(simulated: SimulatedSequence) -> None:
+    assert (simulated.name, len(simulated)) == ("sim", 20)
+    assert np.allclose(simulated.intrinsics.K, simulated.street.K)
+    assert simulated.provenance() == ("simulated/1001",)
+    assert simulated.reference is not None and np.array_equal(simulated.reference[0], np.eye(4))
+    assert simulated.reference[5, 2, 3] > 2.0  # forward is z
+    assert simulated.camera_height_m == pytest.approx(simulated.street.camera_height_m)
+    assert not simulated.has_scan(0)
+
+
+def test_frames_are_those_of_the_street(simulated: SimulatedSequence) -> None:
+    frame, truth = simulated.frame(3), simulated.street.render(3)
+    assert frame.image.shape == (32, 104, 3) and frame.stamp == pytest.approx(truth.stamp)
+    assert np.array_equal(frame.image, truth.image)
+    frame.image[:] = 0
+    assert np.array_equal(simulated.frame(3).image, truth.image)  # the memory is not the caller's
+
+
+def test_excerpt_keeps_the_world(simulated: SimulatedSequence) -> None:
+    excerpt = simulated.cut(4, 10)
+    assert excerpt.provenance() == ("simulated/1001",)
+    assert np.array_equal(excerpt.frame(0).image, simulated.frame(4).image)

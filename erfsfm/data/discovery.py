@@ -70,10 +70,7 @@ def _recordings_at(root: Path) -> list[Recording]:
 
 def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
     """The cameras of a sequence in parts without gaps."""
-    folders = {camera: sequence / f"image_{camera}" for camera in ODOMETRY_CAMERAS}
-    empty = next((folder for folder in folders.values() if folder.is_dir() and not has_images(folder)), None)
-    if empty is not None:
-        raise DataError(f"{empty} holds no png or jpg; download or extract the images")
+    folders = {c: folder for c in ODOMETRY_CAMERAS if (folder := sequence / f"image_{c}").is_dir()}
     poses = root.base / "poses" / f"{sequence.name}.txt"
     recordings = []
     for camera, files, (height, width) in _cameras(folders):
@@ -106,8 +103,9 @@ def open_drive(drive: Path) -> list[Recording]:
     """The cameras of a raw drive in parts without gaps; none where it has no images."""
     drive = drive.absolute()
     oxts = drive / "oxts" / "data"
+    folders = {c: folder for c in RAW_CAMERAS if has_images(folder := drive / f"image_{c}" / "data")}
     recordings = []
-    for camera, files, (height, width) in _cameras({c: drive / f"image_{c}" / "data" for c in RAW_CAMERAS}):
+    for camera, files, (height, width) in _cameras(folders):
         calibration = CalibrationFile(drive.parent / CAM_TO_CAM)
         whole = Recording(
             f"kitti_raw/{drive_name(drive.name)}",
@@ -121,10 +119,11 @@ def open_drive(drive: Path) -> list[Recording]:
 
 def _cameras(folders: dict[Number, Path]) -> Iterator[tuple[Number, NumberedFiles, tuple[int, int]]]:
     """Images of the colour cameras, else of the first of the grey ones, with their height and width."""
-    images = {camera: list_images(folder) for camera, folder in folders.items()}
-    present = [camera for camera in folders if images[camera]]
-    for camera in [camera for camera in present if int(camera) in _COLOUR] or present[:1]:
-        files = by_number(images[camera])
+    for camera in [camera for camera in folders if int(camera) in _COLOUR] or [*folders][:1]:
+        images = list_images(folders[camera])
+        if not images:
+            raise DataError(f"{folders[camera]} holds no png or jpg; download or extract the images")
+        files = by_number(images)
         yield camera, files, first_size(files.paths)
 
 

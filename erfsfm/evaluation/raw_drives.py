@@ -132,7 +132,7 @@ def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
         raise DataError(f"{path} is missing: how far the car moved needs a date and a time a frame")
     stamps = path.read_text().split("\n")
     try:
-        times = np.array([stamps[i].strip() for i in window], "datetime64[ns]")
+        times = np.array([stamps[i].strip() or "nothing" for i in window], "datetime64[ns]")
     except (ValueError, IndexError) as error:
         raise DataError(f"{path} must hold a date and a time a frame: {' '.join(str(error).split())}") from error
     seconds = (times - times[0]) / np.timedelta64(1, "s")

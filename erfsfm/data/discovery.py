@@ -119,7 +119,8 @@ def open_drive(drive: Path) -> list[Recording]:
 
 def _cameras(folders: dict[Number, Path]) -> Iterator[tuple[Number, NumberedFiles, tuple[int, int]]]:
     """Images of the colour cameras, else of the first of the grey ones, with their height and width."""
-    for camera in [camera for camera in folders if int(camera) in _COLOUR] or [*folders][:1]:
+    colour = [camera for camera in folders if int(camera) in _COLOUR]
+    for camera in colour or list(folders)[:1]:
         images = list_images(folders[camera])
         if not images:
             raise DataError(f"{folders[camera]} holds no png or jpg; download or extract the images")

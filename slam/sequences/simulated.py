@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from slam.frames import Image, Intrinsics
+from slam.frames import Image
 from slam.sequences.images import ReadImages
 from slam.sequences.recording import RecordedSequence, Source, uniform_stamps
 from slam.simulation.kitti_layout import simulated_world
@@ -29,12 +29,10 @@ class SimulatedSequence(RecordedSequence):
             image: Image = rendered(index).copy()
             return image
 
-        K = np.asarray(street.K, dtype=np.float64)
-        focal_and_centre = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         super().__init__(
             name,
             ReadImages(options.width, options.height, options.frames, read),
-            Intrinsics(options.width, options.height, *focal_and_centre, readout_s=options.readout_s),
+            street.camera,
             uniform_stamps(options.frames, options.rate),
             (Source(f"simulated/{options.seed}", first=None),),
             T_any_camera=np.asarray(street.T_world_camera, dtype=np.float64),

@@ -86,9 +86,9 @@ def _write_frames(
 
 def _write_records(world: SimulatedWorld, root: Path) -> None:
     """Calibration, times, poses, the camera and what was simulated."""
-    sequence, K, options = root / "sequences" / "sim", world.K, world.options
-    projection = _row(np.column_stack([K, np.zeros(3)]))  # the one camera stands for all four
-    rows = [f"P{camera}: {projection}" for camera in range(4)]
+    sequence, camera, options = root / "sequences" / "sim", world.camera, world.options
+    projection = _row(np.column_stack([camera.K, np.zeros(3)]))  # the one camera stands for all four
+    rows = [f"P{number}: {projection}" for number in range(4)]
     if world.T_camera_lidar is not None:
         rows.append(f"Tr: {_row(world.T_camera_lidar[:3])}")
     write_lines(sequence / "calib.txt", rows)
@@ -96,13 +96,12 @@ def _write_records(world: SimulatedWorld, root: Path) -> None:
     (root / "poses").mkdir()
     stamps = np.arange(len(world), dtype=np.float64)
     write_kitti(root / "poses" / "sim.txt", Trajectory(stamps, world.T_world_camera))
-    camera = {"width": options.width, "height": options.height, "fx": K[0, 0], "fy": K[1, 1]}
-    camera |= {"cx": K[0, 2], "cy": K[1, 2], "fps": options.rate}
+    keys = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")} | {"fps": options.rate}
     if world.camera_height_m is not None:
-        camera["camera_height_m"] = world.camera_height_m
+        keys["camera_height_m"] = world.camera_height_m
     if options.readout_s:
-        camera["readout_ms"] = 1e3 * options.readout_s
-    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()] + ["model: pinhole"])
+        keys["readout_ms"] = 1e3 * options.readout_s
+    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in keys.items()] + ["model: pinhole"])
     write_lines(root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)])
 
 

@@ -15,7 +15,7 @@ from slam.simulation.interior import Interior, furnish
 from slam.simulation.motion import Carried, carry
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
-from slam.simulation.sensors import square_intrinsics
+from slam.simulation.sensors import square_camera
 from slam.simulation.surface import Hits, Surface, place_rays, unlit
 from slam.simulation.texture import GLOWING
 from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
@@ -51,7 +51,7 @@ class SimulatedRooms(SimulatedWorld):
         if options.varied and options.fov_deg is None:
             fov = float(np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG))))
         T_scene_camera = self._carried.poses(self._moments(np.arange(options.frames) / options.rate, options))
-        super().__init__(options, square_intrinsics(options.width, options.height, fov), T_scene_camera)
+        super().__init__(options, square_camera(options.width, options.height, fov), T_scene_camera)
 
     def _build(self) -> Mesh:
         return self._interior.mesh
@@ -73,7 +73,7 @@ class SimulatedRooms(SimulatedWorld):
         if "blur" in options.hazards:
             turned = np.diff(self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2], axis=0)
             open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, 2.0 * SHUTTER * 0.9 / options.rate)
-            blurred_px = np.linalg.norm(turned, axis=1).max() * open_s * options.rate * self.K[0, 0]
+            blurred_px = np.linalg.norm(turned, axis=1).max() * open_s * options.rate * self.camera.fx
             samples = int(np.clip(blurred_px / 4.0, 3, 12))
             offsets = offsets + open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
         if options.readout_s:
@@ -98,7 +98,7 @@ class SimulatedRooms(SimulatedWorld):
     def _shade(
         self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
     ) -> Float32Array:
-        rgb = unlit(surfaces[number].mesh, hits, float(self.K[0, 0]))
+        rgb = unlit(surfaces[number].mesh, hits, self.camera.fx)
         if number > 0:  # people are as bright as what is below them
             down = rays.copy()
             down[:, :3] += rays[:, 3:] * hits.depth[:, None]

@@ -1,4 +1,4 @@
-"""What measures in a world: the camera's rays and pixels, and a spinning 64-beam LiDAR on the roof."""
+"""What measures in a world: the camera and its pixels, and a spinning 64-beam LiDAR on the roof."""
 
 import numpy as np
 
@@ -9,17 +9,10 @@ from slam.simulation.geometry import Float32Array, FloatArray
 KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 
 
-def square_intrinsics(width: int, height: int, fov_deg: float) -> FloatArray:
-    """Camera matrix ``(3, 3)`` of square pixels with a horizontal field of view, its centre in the middle."""
-    focal_px = 0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg))
-    return Intrinsics(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1)).K
-
-
-def pixel_rays(K: FloatArray, width: int, height: int) -> Float32Array:
-    """Directions with z = 1 through every pixel, row by row, camera frame, ``(H * W, 3)``."""
-    v, u = np.mgrid[0:height, 0:width].reshape(2, -1)
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(width * height)], axis=1)
-    return rays.astype(np.float32)
+def square_camera(width: int, height: int, fov_deg: float) -> Intrinsics:
+    """Of square pixels with a horizontal field of view, its centre in the middle."""
+    focal_px = float(0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg)))
+    return Intrinsics(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))
 
 
 def footprint(

@@ -17,7 +17,7 @@ from slam.simulation.light import draw_varied_weather, draw_weather, paint, sky
 from slam.simulation.objects import bonnet
 from slam.simulation.options import SimulationOptions
 from slam.simulation.route import plan_route
-from slam.simulation.sensors import KITTI_CAMERA, T_CAMERA_LIDAR, beam_directions, measured, square_intrinsics
+from slam.simulation.sensors import KITTI_CAMERA, T_CAMERA_LIDAR, beam_directions, measured, square_camera
 from slam.simulation.surface import Hits, Surface, place_rays
 from slam.simulation.town import build_town
 from slam.simulation.variety import draw_variety
@@ -37,11 +37,11 @@ class SimulatedStreet(SimulatedWorld):
         size = options.width, options.height
         still = effects.STILL_FRAMES if "stop" in options.hazards else 0
         variety = draw_variety(options.seed, options.route == "straight") if options.varied else None
-        K = KITTI_CAMERA.resized(*size).K if variety is None else variety.intrinsics(*size)
+        camera = KITTI_CAMERA.resized(*size) if variety is None else variety.camera(*size)
         if options.fov_deg is not None:
-            K = square_intrinsics(*size, options.fov_deg)
+            camera = square_camera(*size, options.fov_deg)
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
-        super().__init__(options, K, self._route.T_street_camera)
+        super().__init__(options, camera, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
         self.T_camera_lidar = T_CAMERA_LIDAR.copy()
         self._variety = variety
@@ -79,8 +79,8 @@ class SimulatedStreet(SimulatedWorld):
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
         rng = np.random.default_rng([self.options.seed, 12])
-        below = (self.options.height * (1.0 - self._variety.bonnet) - self.K[1, 2]) / self.K[1, 1]
-        return Moving(rng, [lambda soup: bonnet(soup, rng, float(below), self.camera_height_m)])
+        below = (self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy) / self.camera.fy
+        return Moving(rng, [lambda soup: bonnet(soup, rng, below, self.camera_height_m)])
 
     @functools.cached_property
     def _gain(self) -> float:
@@ -113,7 +113,7 @@ class SimulatedStreet(SimulatedWorld):
         lit[pixels[towards]] = 1.0 - shadow
         soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))  # over neighbouring pixels
         lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
-        return paint(surfaces[number].mesh, hits, lit, self._weather, float(self.K[0, 0]))
+        return paint(surfaces[number].mesh, hits, lit, self._weather, self.camera.fx)
 
     def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
         """Rain, lens blur, exposure, and quantisation to 8 bits."""

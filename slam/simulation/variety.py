@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from slam.simulation.geometry import FloatArray
+from slam.frames import Intrinsics
 
 StreetKind = Literal["town", "avenue", "country", "motorway"]
 
@@ -31,12 +31,12 @@ class Variety:
     noise: float  # of the sensor, standard deviation as a share of white
     blur_px: float  # of the lens, standard deviation
 
-    def intrinsics(self, width: int, height: int) -> FloatArray:
-        """Camera matrix of images of this size, ``(3, 3)``."""
-        across = 0.5 / np.tan(0.5 * np.deg2rad(self.fov_deg))  # focal length in widths
+    def camera(self, width: int, height: int) -> Intrinsics:
+        """That of images of this size."""
+        across = float(0.5 / np.tan(0.5 * np.deg2rad(self.fov_deg)))  # focal length in widths
         fx, fy = across * width, across * (width if self.aspect is None else self.aspect * height)
         cx, cy = (0.5 + self.centre[0]) * width - 0.5, (0.5 + self.centre[1]) * height - 0.5
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return Intrinsics(width, height, fx, fy, cx, cy)
 
 
 def draw_variety(seed: int, lone_road: bool) -> Variety:

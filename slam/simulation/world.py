@@ -2,17 +2,17 @@
 
 import functools
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.simulation.options import SimulationOptions
-from slam.simulation.sensors import pixel_rays
 from slam.simulation.surface import Hits, Surface, distances, facing_normals, place_rays
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
@@ -33,7 +33,8 @@ class SimulatedWorld(ABC):
 
     Attributes:
         options: what is simulated.
-        K: camera matrix, ``(3, 3)``.
+        camera: through which it is seen, with the read-out of its shutter.
+        K: its matrix, ``(3, 3)``.
         T_world_camera: every pose in the frame of the first camera, ``(N, 4, 4)``.
         camera_height_m: of the camera above the road; None where there is no road.
         T_camera_lidar: ``(4, 4)``; None without a LiDAR.
@@ -42,13 +43,13 @@ class SimulatedWorld(ABC):
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
 
-    def __init__(self, options: SimulationOptions, K: FloatArray, T_scene_camera: FloatArray) -> None:
+    def __init__(self, options: SimulationOptions, camera: Intrinsics, T_scene_camera: FloatArray) -> None:
         """A world seen through a camera from poses ``(N, 4, 4)``."""
-        self.options, self.K = options, K
+        self.options, self.camera, self.K = options, replace(camera, readout_s=options.readout_s), camera.K
         self._T_scene_camera = T_scene_camera
         self.T_world_camera: FloatArray = se3.invert(T_scene_camera[0]) @ T_scene_camera
         self.T_world_camera[0] = np.eye(4)
-        self._rays = pixel_rays(K, options.width, options.height)
+        self._rays = camera.rays(camera.pixel_grid()).reshape(-1, 3).astype(np.float32)
         self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)  # ray length per depth
 
     @abstractmethod

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
+from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import FLAT, Material, Soup
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
-from slam.simulation.sensors import pixel_rays
 from slam.simulation.street import SimulatedStreet
 from slam.simulation.surface import Surface, place_rays
 from slam.simulation.variety import draw_variety
@@ -188,7 +188,7 @@ def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
         write_kitti_root(street, root)
 
 
-K = np.array([[100.0, 0.0, 31.5], [0.0, 50.0, 15.5], [0.0, 0.0, 1.0]])
+CAMERA = Intrinsics(64, 32, 100.0, 50.0, 31.5, 15.5)
 # a camera that looks east: right is south, down is down
 T_SCENE_CAMERA = se3.make(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.5]))
 
@@ -198,7 +198,7 @@ def test_depth_of_a_slope_is_that_of_hand(slope: float) -> None:
     soup = Soup(np.random.default_rng(0))
     ground = soup.instance(Material.ASPHALT, np.full(3, 0.3))
     soup.quad(np.array([0.0, -500.0, 0.0]), np.array([900.0, 0.0, 900.0 * slope]), np.array([0.0, 1000.0, 0.0]), ground)
-    rays = place_rays(T_SCENE_CAMERA, pixel_rays(K, 64, 32))
+    rays = place_rays(T_SCENE_CAMERA, CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3).astype(np.float32))
     depth = Surface.of(soup.finish(FLAT)).cast(rays)["t_hit"].reshape(32, 64)
     row = np.arange(22, 32)
     expected = 1.5 / ((row - 15.5) / 50.0 + slope)  # 1.5 - depth (v - cy) / fy = slope depth
@@ -221,7 +221,7 @@ def test_varieties_cover_streets_and_cameras() -> None:
 
 def test_a_camera_keeps_its_field_of_view_when_its_image_is_shrunk() -> None:
     one = next(one for one in (draw_variety(seed, True) for seed in range(50)) if one.aspect is not None)
-    K = one.intrinsics(416, 128)
+    K = one.camera(416, 128).K
     assert 2.0 * np.rad2deg(np.arctan(208.0 / K[0, 0])) == pytest.approx(one.fov_deg)
     assert K[1, 1] / K[0, 0] == pytest.approx(one.aspect * 128 / 416)
 

@@ -205,20 +205,15 @@ def test_test_sequences_are_never_trained_on(kitti: Path) -> None:
     assert names(DataConfig(roots=[kitti])) == (["kitti_odometry/00[0:6]"], [])
 
 
-def test_ranges(kitti: Path) -> None:
-    config = DataConfig(roots=[kitti], ranges={"kitti_odometry/00": "1:4"}, exclude=[])
-    training, _ = names(config)
-    assert training[0] == "kitti_odometry/00[1:4]"
-    assert len(training) == 4
-
-
 def test_a_misspelt_kind_is_not_left_in_the_training(kitti: Path) -> None:
     with pytest.raises(DataError, match=r"data\.exclude names 'simulatd/3'"):
         split_recordings(DataConfig(roots=[kitti], exclude=["simulatd/3"]))
 
 
-def test_exclude_a_part(kitti: Path) -> None:
-    """The frames around it train."""
+def test_ranges_and_parts_that_are_excluded(kitti: Path) -> None:
+    """The frames around such a part train."""
+    training, _ = names(DataConfig(roots=[kitti], ranges={"kitti_odometry/00": "1:4"}, exclude=[]))
+    assert training[0] == "kitti_odometry/00[1:4]" and len(training) == 4
     held_back = ["kitti_raw/2011_10_03_drive_0027[2:4]", "kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"]
     config = DataConfig(roots=[kitti], exclude=held_back)
     assert names(config)[0] == ["kitti_odometry/00[0:2]", "kitti_odometry/00[4:6]"]

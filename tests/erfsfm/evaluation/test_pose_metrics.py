@@ -34,10 +34,6 @@ def random_poses(rng: np.random.Generator, count: int) -> Poses:
     return T
 
 
-def about_y(angle: float) -> Poses:
-    return np.asarray(Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix())
-
-
 def test_a_scaled_copy_is_perfect() -> None:
     true = snippets_from_trajectory(random_poses(np.random.default_rng(1), 12))
     predicted = true.copy()
@@ -58,7 +54,7 @@ def test_hand_value_of_ate_is_norm_over_five_after_its_own_scale() -> None:
 def test_hand_value_of_re_counts_the_first_frame() -> None:
     true, predicted = straight([0, 1, 2, 3, 4])[None], straight([0, 1, 2, 3, 4])[None]
     for k in range(1, 5):
-        predicted[0, k, :3, :3] = about_y(0.1 * k)
+        predicted[0, k, :3, :3] = Rotation.from_rotvec([0.0, 0.1 * k, 0.0]).as_matrix()
     errors = snippet_errors(predicted, true)
     assert errors.re_mean == pytest.approx(1.0 / 5, rel=1e-12)
 

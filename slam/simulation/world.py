@@ -22,6 +22,7 @@ FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 class SimulatedFrame:
     """One frame with its truth."""
 
+    index: int  # number of the frame
     stamp: float  # seconds
     image: NDArray[np.uint8]  # (H, W, 3) uint8 RGB
     depth: Float32Array  # z-depth in metres, 0 where nothing was hit, (H, W) float32
@@ -92,7 +93,7 @@ class SimulatedWorld(ABC):
         else:
             rgb, depth = np.mean([view[0] for view in views], axis=0), self.depth(index)
         stamp = index / self.options.rate
-        return SimulatedFrame(stamp, self._develop(rgb, index), depth, self.T_world_camera[index].copy())
+        return SimulatedFrame(index, stamp, self._develop(rgb, index), depth, self.T_world_camera[index].copy())
 
     def depth(self, index: int) -> Float32Array:
         """The z-depth ``(H, W)`` of `render`, without the image."""

@@ -44,7 +44,9 @@ def load_config(
     origin = "the defaults"
     if file_or_name is not None:
         path = find_config(file_or_name, shipped)
-        origin, tree = str(path), _read_tree(path)
+        origin, tree = str(path), read_yaml(path) or {}
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
     for text in overrides:
         _override(tree, text)
     try:
@@ -95,13 +97,6 @@ def first_problem(error: ValidationError) -> str:
     in_short = {"missing": "missing", "extra_forbidden": "unknown key"}
     said = in_short.get(first["type"], first["msg"].removeprefix("Value error, "))
     return f"{place}: {said}" if place else said
-
-
-def _read_tree(path: Path) -> dict[str, Any]:
-    tree = read_yaml(path)
-    if not isinstance(tree, dict | None):
-        raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
-    return tree or {}
 
 
 def _override(tree: dict[str, Any], text: str) -> None:

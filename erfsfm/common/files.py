@@ -7,12 +7,12 @@ import fcntl
 import os
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from erfsfm.common.errors import BusyError, ConfigError
+from erfsfm.common.errors import BusyError, ConfigError, OneLineError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,12 +61,22 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
             partial.unlink(missing_ok=True)
 
 
-def is_foreign(path: Path, mark: str) -> bool:
-    """Whether something is at ``path`` that is no file with ``mark`` in it, by which a program knows its own."""
-    try:
-        return mark.encode() not in read_bytes(path, MAX_TEXT_BYTES)
-    except OSError:  # a folder, or a larger file
-        return path.exists()
+def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) -> None:
+    """Refuse to replace files none of which has ``mark`` in it, by which a program knows its own.
+
+    Raises:
+        OneLineError: of the given kind.
+    """
+
+    def is_foreign(path: Path) -> bool:
+        try:
+            return mark.encode() not in read_bytes(path, MAX_TEXT_BYTES)
+        except OSError:  # a folder, or a larger file
+            return True
+
+    there = [path for path in files if path.exists()]
+    if there and all(map(is_foreign, there)):
+        raise error(f"{there[0]} is none of ours and would be replaced: choose another --output")
 
 
 def read_bytes(path: Path, most: int) -> bytes:
@@ -105,8 +115,7 @@ def require_figure(path: Path) -> None:
     """
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         raise ConfigError(f"figures are written as {', '.join(FIGURE_SUFFIXES)}; got '{path.name}'")
-    if is_foreign(path, _FIGURE_MARK):
-        raise ConfigError(f"{path} exists and is no figure of erfsfm: choose another --output, or remove it")
+    refuse_foreign([path], _FIGURE_MARK, ConfigError)
 
 
 def save_figure(figure: Figure, path: Path, dpi: int) -> None:

@@ -12,9 +12,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.files import require_figure, save_figure
+from erfsfm.common.files import refuse_foreign, require_figure, save_figure
 from erfsfm.common.progress import Progress
-from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
+from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import image_folder, list_images
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames
@@ -37,7 +37,6 @@ _MOST_FOCAL_SIGMA = 0.005  # of the focal length
 _LEAST_TILT_DEG = 10.0
 _LEAST_COVERED = 0.3  # of the image
 _WELL_COVERED = 0.6
-_MARK = "erfsfm-slam calibrate"  # of a camera file that was calibrated
 _SIZE_INCHES, _DPI = (13.0, 5.0), 100
 _ARROW_LENGTH = 0.05  # of the image's width, of an error as large as the root mean square
 
@@ -115,12 +114,13 @@ def calibrate_camera(
         raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
     among_images = any(path.stem != output.stem for path in list_images(output.parent))
     picture = output.with_suffix(".pdf" if among_images else ".png")
-    _refuse_other_kind(output, picture)
+    refuse_foreign([output], "fx:", CalibrationError)  # any camera file may be calibrated again
     require_figure(picture)
     images, own_fps = _open(recording)
     views = chosen_views(find_views(images, board, progress))
     fit = fit_camera(views, images.width, images.height, model)
-    source = f"{_MARK}: {len(fit.views)} views of a {board.describe()}, reprojection error {fit.error_px:.3f} pixels"
+    source = f"erfsfm-slam calibrate: {len(fit.views)} views of a {board.describe()}, "
+    source += f"reprojection error {fit.error_px:.3f} pixels"
     fx, fy, cx, cy = map(_rounded, fit.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     camera = CameraFile(
         width=fit.width,
@@ -257,20 +257,6 @@ def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: Ima
     for axis in (before, after):
         axis.set_axis_off()
     save_figure(figure, path, _DPI)
-
-
-def _refuse_other_kind(output: Path, picture: Path) -> None:
-    """A picture is replaced beside a camera file that was calibrated."""
-    if output.is_dir():
-        raise CalibrationError(f"--output {output} is a folder: give the name of a file to write")
-    source = None
-    if output.is_file() and output.stat().st_size:
-        try:
-            source = read_camera_file(output).source
-        except DataError as error:
-            raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
-    if picture.exists() and not (source or "").startswith(_MARK):
-        raise CalibrationError(f"{picture} exists and is of no earlier calibration: choose another --output")
 
 
 def _open(recording: Path) -> tuple[ImageSource, float | None]:

@@ -51,7 +51,7 @@ def against_reference(
         SlamError: a file cannot be read or written, or an error is over its limit.
     """
     if csv is not None:
-        check_replaced(csv, {".csv": b"system,path"})
+        check_replaced(csv, b"system,path")
     runs = compare(named_paths(paths), reference, format, frames)
     if csv is not None:
         content = csv_of(dict(_flat(run.tree())) for run in runs)

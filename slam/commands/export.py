@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from erfsfm.common.errors import ErfsfmError
-from erfsfm.common.files import is_foreign
+from erfsfm.common.files import refuse_foreign
 from erfsfm.common.progress import Progress, silent
 from slam.commands.occupancy import occupancy_grid, write_ros_map
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
@@ -46,9 +46,10 @@ POINTS, TRANSFORMS = "points.ply", "transforms.json"
 _IMAGES = "images"
 _MADE_BY = {"made_by": "erfsfm-slam"}
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
-_SCENES = {  # noun, files, and what one of them holds if it is ours
-    "colmap": ("a COLMAP model", (_IMAGES, BINARY_FOLDER, *MODEL_FILES), MODEL_FILES[0], HEADER),
-    "nerfstudio": ("a scene", (_IMAGES, POINTS, TRANSFORMS), TRANSFORMS, json.dumps(_MADE_BY)[1:-1]),
+_SUFFIXES = {"mesh": (".ply",), "cloud": (".ply",), "occupancy": (".yaml", ".pgm"), "colmap": (), "nerfstudio": ()}
+_SCENES = {  # files, and what one of them holds if it is ours
+    "colmap": ((_IMAGES, BINARY_FOLDER, *MODEL_FILES), HEADER),
+    "nerfstudio": ((_IMAGES, POINTS, TRANSFORMS), json.dumps(_MADE_BY)[1:-1]),
 }
 _T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_PIXEL = 0.5  # (0.5, 0.5) is the centre of their top-left pixel
@@ -120,30 +121,18 @@ def export(
 
 def _check_target(what: str, output: Path) -> None:
     """Refuse, before anything is computed, what would replace a file of another kind."""
-    if what in _SCENES:
-        noun, names, marked, mark = _SCENES[what]
-        if output.exists() and not output.is_dir():
-            raise RunError(f"{output} is a file: {noun} is several files, give the name of a folder")
-        others = [name for name in names if (output / name).exists()]
-        if others and not _is_own(output / marked, mark):
-            raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
-        return
-    beginnings = {".yaml": b"", ".pgm": b"P5"} if what == "occupancy" else {".ply": b"ply"}
-    if output.suffix.lower() not in beginnings:
-        named = " or ".join(beginnings)
-        raise RunError(f"{what} is written as {named}; got '{output.name}', give a name that ends so")
-    files = [output]
-    if what == "occupancy":
-        files = [output.with_suffix(suffix) for suffix in beginnings]
-        present = [path for path in files if path.is_file() and path.stat().st_size]
-        if present and not _is_own(files[0], "occupied_thresh:"):
-            raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
-    for path in files:
-        check_replaced(path, beginnings)
-
-
-def _is_own(path: Path, mark: str) -> bool:
-    return path.is_file() and not is_foreign(path, mark)
+    suffixes = _SUFFIXES[what]
+    if not suffixes and output.exists() and not output.is_dir():
+        raise RunError(f"{output} is a file: {what} is several files, give the name of a folder")
+    if suffixes and output.suffix.lower() not in suffixes:
+        raise RunError(f"{what} is written as {' or '.join(suffixes)}; got '{output.name}', give a name that ends so")
+    if what in _MAPS:
+        check_replaced(output, b"ply")
+    elif what == "occupancy":
+        refuse_foreign([output.with_suffix(suffix) for suffix in suffixes], "occupied_thresh:", RunError)
+    else:
+        names, mark = _SCENES[what]
+        refuse_foreign([output / name for name in names], mark, RunError)
 
 
 def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Path:
@@ -151,9 +140,9 @@ def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Pat
     if unit not in (METRES, CAMERA_HEIGHTS):
         raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
     mesh, trajectory = _map(folder, "mesh", "z"), _trajectory(folder, "z")
-    cells, grid = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
+    cells, corner = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
     written = output.with_suffix(".yaml")
-    write_ros_map(written, cells, (grid.x_min, grid.y_min), resolution, unit)
+    write_ros_map(written, cells, corner, resolution, unit)
     return written
 
 

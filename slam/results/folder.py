@@ -9,7 +9,7 @@ import itertools
 import logging
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 from html import escape
@@ -159,12 +159,8 @@ class RunFolder:
         return (metrics.failure or "it ran without a map") if why == NOT_RECORDED else why
 
 
-def check_replaced(path: Path, beginnings: Mapping[str, bytes] | None = None) -> None:
-    """Check what a file would replace.
-
-    Args:
-        path: the file to write.
-        beginnings: ends of the names that it may have, and how such files begin; None of any trajectory.
+def check_replaced(path: Path, begin: bytes | None = None) -> None:
+    """Check what a file would replace: a file with this ``begin``, by default any trajectory.
 
     Raises:
         RunError: a folder, a file of a run, or one of another kind.
@@ -173,22 +169,18 @@ def check_replaced(path: Path, beginnings: Mapping[str, bytes] | None = None) ->
         raise RunError(f"{path} is a folder: give the name of a file to write")
     if path.name in MEANINGS and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
         raise RunError(f"{path} is a file of a run: choose another --output")
-    if path.is_file() and path.stat().st_size and not _is_of_kind(path, beginnings):
+    if path.is_file() and path.stat().st_size and not _is_of_kind(path, begin):
         raise RunError(f"{path} exists and is a file of another kind than is written: choose another --output")
 
 
-def _is_of_kind(path: Path, beginnings: Mapping[str, bytes] | None) -> bool:
-    suffix = path.suffix.lower()
-    if suffix not in (_TRAJECTORIES if beginnings is None else beginnings):
-        return False
-    if beginnings is not None:
+def _is_of_kind(path: Path, begin: bytes | None) -> bool:
+    if begin is not None:
         with path.open("rb") as file:
-            return file.read(64).startswith(beginnings[suffix])
+            return file.read(len(begin)) == begin
     try:
-        read_trajectory(path)
+        return path.suffix.lower() in _TRAJECTORIES and len(read_trajectory(path)) > 0
     except TrajectoryError:
         return False
-    return True
 
 
 def check_output(output: Path) -> None:

@@ -19,7 +19,7 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
-from slam.results.metrics import MAP_ERRORS, SIZES, MapMetrics, Metrics, Provenance
+from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import map_view
 from slam.results.report.page import Picture, write_report
 from slam.results.report.pictures import DepthPictures, loop_pictures
@@ -92,7 +92,7 @@ class FolderRecorder(Recorder):
         """Merge the submaps, write mesh and cloud; without a map its metrics are the reason."""
         surface = self._surface(estimate)
         if isinstance(surface, Failed):
-            self._metrics = self._metrics.changed(map=MapMetrics.unknown(surface.reason, *SIZES, *MAP_ERRORS))
+            self._metrics = self._metrics.changed(map=MapMetrics.unknown(surface.reason))
             return
         assert isinstance(estimate, Estimate) and estimate.map is not None
         self._progress("map files", 0, 1)

@@ -69,7 +69,9 @@ def test_another_image_stays(tmp_path: Path) -> None:
     image = tmp_path / "000000.png"
     cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
     before = image.read_bytes()
-    with pytest.raises(ConfigError, match=r"000000\.png exists and is no figure of erfsfm: choose another --output"):
+    with pytest.raises(
+        ConfigError, match=r"000000\.png is none of ours and would be replaced: choose another --output"
+    ):
         save_figure(Figure(), image, dpi=50)
     assert image.read_bytes() == before
 

@@ -35,9 +35,8 @@ def test_one_process_of_many_starts_no_threads() -> None:
         "from erfsfm.common.threads import stay_single_threaded, usable_cores\n"
         "cv2.setNumThreads(3)\n"
         "stay_single_threaded()\n"
-        "import torch\n"
         "counts = [pool['num_threads'] for pool in threadpool_info()]\n"
-        "assert {*counts, cv2.getNumThreads(), usable_cores(), torch.get_num_threads()} == {1}, counts\n"
+        "assert {*counts, cv2.getNumThreads(), usable_cores()} == {1}, counts\n"  # as PyTorch, too, counts them
     )
     threads = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     free = {name: value for name, value in os.environ.items() if name not in threads}

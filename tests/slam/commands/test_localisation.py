@@ -84,7 +84,7 @@ def save(path: Path, image: Image) -> None:
 def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
     localiser = Localiser(places())
     found = 0
-    for k in range(4, 58, 6):
+    for k in range(4, 58, 12):
         result = localiser.locate(f"{k}", street(630, hazards).frame(k).image)
         if result.T_world_camera is None:
             continue
@@ -93,7 +93,7 @@ def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple
         away = np.linalg.norm(result.T_world_camera[:3, 3] / UNIT - reference()[k, :3, 3])
         assert away < 0.5 and rotation_angle(T_error[:3, :3]) < np.deg2rad(1.0)
         assert result.nearest_frame is not None and abs(result.nearest_frame - k) <= 2 and result.inliers >= 20
-    assert found >= 7
+    assert found >= 4
 
 
 def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -> None:
@@ -103,7 +103,7 @@ def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -
         for view in places().views
     )
     localiser = Localiser(replace(places(), views=views))
-    for k in (10, 25, 40):
+    for k in (10, 40):
         found = localiser.locate(f"{k}", street(630).frame(k).image).T_world_camera
         assert found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
 
@@ -127,12 +127,8 @@ def bent(image: Image, camera: CameraFile) -> Image:
     return np.asarray(cv2.remap(image, seen.astype(np.float32), None, cv2.INTER_LINEAR), np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("where", "given"), [("images", ("", "images/25.png")), (".", ("images", "images/25.png")), (None, ())]
-)
-def test_images_of_a_lens_need_its_camera_file(
-    run: RunFolder, tmp_path: Path, where: str | None, given: tuple[str, ...]
-) -> None:
+@pytest.mark.parametrize(("where", "given"), [("images", "images/25.png"), (".", "images"), (None, "")])
+def test_images_of_a_lens_need_its_camera_file(run: RunFolder, tmp_path: Path, where: str | None, given: str) -> None:
     """It is looked for where ``run`` looks."""
     run.write(PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write)
     pinhole = places().intrinsics
@@ -145,10 +141,9 @@ def test_images_of_a_lens_need_its_camera_file(
             localise(tmp_path / "album", run)
         return
     (tmp_path / "album" / where / "camera.yaml").write_text(lens.model_dump_json(exclude_none=True))
-    for images in given:
-        (found,) = localise(tmp_path / "album" / images, run)
-        assert found.T_world_camera is not None, found.reason
-        assert np.linalg.norm(found.T_world_camera[:3, 3] / UNIT - reference()[25, :3, 3]) < 0.5
+    (found,) = localise(tmp_path / "album" / given, run)
+    assert found.T_world_camera is not None, found.reason
+    assert np.linalg.norm(found.T_world_camera[:3, 3] / UNIT - reference()[25, :3, 3]) < 0.5
 
 
 def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path) -> None:
@@ -162,7 +157,7 @@ def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, albu
 @pytest.mark.parametrize("what", ["another street", "noise", "black"])
 def test_images_of_other_places_are_refused(what: str) -> None:
     images = {
-        "another street": [street(seed).frame(k).image for seed in (631, 632) for k in range(5, 55, 20)],
+        "another street": [street(seed).frame(k).image for seed, k in ((631, 5), (632, 45))],
         "noise": [np.random.default_rng(0).integers(0, 255, (96, 312, 3), np.uint8)],
         "black": [np.zeros((96, 312, 3), np.uint8)],
     }[what]

@@ -26,7 +26,7 @@ from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 
-OPTIONS = SimulationOptions("straight", frames=24, seed=702, width=312, height=96)
+OPTIONS = SimulationOptions("straight", frames=14, seed=702, width=312, height=96)
 CAMERA = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5)
 DEPTH = np.full((6, 8), 5.0, np.float32)
 

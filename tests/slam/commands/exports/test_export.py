@@ -82,8 +82,8 @@ def test_errors_are_clear_and_leave_nothing(
     ("what", "name", "why"),
     [
         ("mesh", "run/map_mesh.ply", "is a file of a run"),
-        ("occupancy", "camera.yaml", "exists and is no map of ROS"),
-        ("occupancy", "drive/photo.yaml", "photo.pgm exists and is no map of ROS"),
+        ("occupancy", "camera.yaml", "camera.yaml is none of ours"),
+        ("occupancy", "drive/photo.yaml", "photo.pgm is none of ours"),
         ("mesh", "drive/thesis.ply", "thesis.ply exists and is a file of another kind"),
         ("colmap", "drive", "drive/images is none of ours"),
     ],

@@ -107,12 +107,9 @@ def options_of_drives(
 
 
 def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
-    """The drives of a manifest, or the named sequences of a data set.
+    """The drives of a manifest, or the named sequences of a data set, ``all`` of them every one.
 
-    Args:
-        manifest_or_root: a ``.csv`` file, or a data set.
-        sequences: names in the data set; ``all`` is every one.
-        options: of ``run``, for all drives; those of a manifest come after them.
+    These ``options`` of ``run`` are for all drives; those of a manifest come after them.
 
     Raises:
         SlamError: no such file or sequences, or an entry that is not understood.
@@ -134,14 +131,14 @@ def run_drives(
     threads: int | None = None,
     memory_gib: float = 0.0,
 ) -> list[Outcome]:
-    """Run the drives that are not whole in ``output``, and write ``drives.csv``; one outcome a drive, in their order.
+    """Run drives, and write ``drives.csv``; one outcome a drive, in their order.
 
     Args:
-        drives: to run.
+        drives: to run; those that are whole there are kept.
         output: folder of their run folders.
         count: drives at a time on this machine.
         scheduler: address of a Dask scheduler in place of this machine.
-        progress: called with (stage, done, total).
+        progress: is told how many have ended.
         threads: of a drive; None for the cores of this machine by the workers.
         memory_gib: that a drive may use; 0 for all.
 

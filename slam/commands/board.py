@@ -80,11 +80,6 @@ class Detector:
     """Finds the corners of a board in grey images."""
 
     def __init__(self, board: Board) -> None:
-        """Prepare the search.
-
-        Raises:
-            CalibrationError: see `Board.charuco`.
-        """
         self._board = board
         beside_marker = (1 - board.marker_share) / 2
         self._window = _WINDOW if board.pattern == "chessboard" else min(_WINDOW, beside_marker)

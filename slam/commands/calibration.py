@@ -92,19 +92,10 @@ class Calibration:
 def calibrate_camera(
     recording: Path, board: Board, model: Model, output: Path, fps: float | None, progress: Progress
 ) -> list[str]:
-    """Calibrate a camera from a video or a folder of images of a board.
+    """Calibrate a camera from a video or a folder of images of a board; what was found, in lines for the user.
 
-    Args:
-        recording: a video, or a folder of images of one size.
-        board: the board.
-        model: of the lens.
-        output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``, or among
-            other images, where it would be one of them, as ``camera.pdf``.
-        fps: to write; None for the rate of the video, or 10.
-        progress: called with (stage, done, total).
-
-    Returns:
-        What was found, in lines for the user.
+    A picture of the fit is written beside ``output``, ``camera.yaml``: ``camera.png``, or among other images, where it
+    would be one of them, ``camera.pdf``. Without ``fps`` the rate of the video is written, or 10.
 
     Raises:
         CalibrationError: the images do not give a camera; nothing is written.

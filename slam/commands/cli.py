@@ -64,8 +64,7 @@ def run(
 
     Example: erfsfm-slam run --dataset KITTI --sequence 09
     """
-    from slam.commands.run.request import RunRequest
-    from slam.commands.run.run import perform
+    from slam.commands.run.run import RunRequest, perform
 
     with progress_bar() as progress:
         folder = perform(RunRequest.of(**_given(context), progress=progress))

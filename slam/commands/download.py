@@ -45,7 +45,7 @@ def download_kitti(
         server: address of the folder of the archives.
         is_grey: the grey camera instead of the colour camera.
         with_scans: LiDAR as well.
-        progress: called with (stage, done, total).
+        progress: is told how many files are there.
 
     Returns:
         The number of files.

@@ -45,11 +45,7 @@ def against_reference(
     as_json: bool,
     csv: Path | None,
 ) -> None:
-    """Any number of trajectories against one truth, as a table of systems.
-
-    Raises:
-        SlamError: a file cannot be read or written, or an error is over its limit.
-    """
+    """Any number of trajectories against one truth, as a table of systems; `SlamError` where one is over its limit."""
     if csv is not None:
         check_replaced(csv, b"system,path")
     runs = compare(named_paths(paths), reference, format, frames)
@@ -66,11 +62,7 @@ def against_reference(
 
 
 def of_runs(paths: Sequence[Path], as_json: bool) -> None:
-    """Run folders side by side.
-
-    Raises:
-        SlamError: one is none.
-    """
+    """Run folders side by side."""
     runs = [RunFolder.open(path) for path in paths]
     if as_json:
         typer.echo(json.dumps(runs_json(runs), indent=2))
@@ -79,11 +71,7 @@ def of_runs(paths: Sequence[Path], as_json: bool) -> None:
 
 
 def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool) -> None:
-    """One trajectory against another under every alignment, with the commands of evo that give the same.
-
-    Raises:
-        SlamError: a file cannot be read, or an error is over its limit.
-    """
+    """One trajectory against another under every alignment, with the commands of evo that give the same."""
     (run,) = compare([("", estimate)], reference, format)
     if as_json:
         typer.echo(run.errors.to_json())

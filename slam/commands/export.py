@@ -80,13 +80,11 @@ def export(
         output: the file; for ``colmap`` and ``nerfstudio`` the folder.
         up: ``y-down`` as the run has it; ``z``: x right, y ahead, z up. Cameras keep their own axes, only the world is
             rotated.
-        resolution: side of a cell of an occupancy grid.
-        dataset: where the images of the run are now, for ``colmap`` and ``nerfstudio``; None where the run found them.
-        points: at most so many of a COLMAP model.
-        progress: called with (stage, done, total).
+        resolution, dataset, points: as ``erfsfm-slam export --help`` explains them.
+        progress: is told how many images are written.
 
     Returns:
-        What was written.
+        What was written: of an occupancy grid the ``.yaml``.
 
     Raises:
         SlamError: an option without effect, a part that the run lacks or that is damaged, missing or other images, or a

@@ -88,7 +88,7 @@ def localise(
         camera: their ``camera.yaml``; None for the one beside them or their folder, or else the camera of the run.
         frames: ``A:B``, half-open, of the images in their order; None for all.
         every: of these, every n-th.
-        progress: called with (stage, done, total).
+        progress: is told how many images are done.
 
     Raises:
         SlamError, DataError: no images or none that can be read, no places in the run, a camera file that does not fit,

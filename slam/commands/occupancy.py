@@ -67,7 +67,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Grid:
-    """Square cells of the x-y plane, row by row from the smallest y; ``first`` ``(2,)`` counts cells from the origin."""
+    """Square cells of the x-y plane, row by row from the smallest y; ``first`` ``(2,)`` counts from the origin."""
 
     first: FloatArray
     width: int

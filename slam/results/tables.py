@@ -73,11 +73,7 @@ def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
 
 
 def runs_table(runs: Sequence[RunFolder]) -> Table:
-    """One row for each run and trajectory; runs that failed or were killed with the reason.
-
-    Raises:
-        RunError: a ``metrics.json`` is damaged.
-    """
+    """One row for each run and trajectory; runs that failed or were killed with the reason."""
     rows: list[list[str]] = []
     notes: dict[str, None] = {UNITS: None}
     for name, metrics in zip(_names(runs), (run.metrics() for run in runs)):
@@ -100,11 +96,7 @@ def runs_table(runs: Sequence[RunFolder]) -> Table:
 
 
 def runs_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
-    """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory.
-
-    Raises:
-        RunError: a ``metrics.json`` is damaged.
-    """
+    """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory."""
     objects = []
     for run in runs:
         metrics = run.metrics()

@@ -18,8 +18,7 @@ from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.signals import raising_on_termination
 from slam.commands.live.source import Source, open_source
 from slam.commands.run.recorder import FolderRecorder
-from slam.commands.run.request import Request
-from slam.commands.run.run import provenance_of, record
+from slam.commands.run.run import Request, provenance_of, record
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics

@@ -56,14 +56,10 @@ def write_report(
     view: MapView | None = None,
     metrics: Metrics | None = None,
 ) -> None:
-    """Write ``report.html`` from the files of a folder; also for a failed run.
+    """Write ``report.html`` from the files of a run, also of a failed one, and what they do not hold.
 
-    Args:
-        folder: the run, with its trajectories written.
-        depths: strips of images and their depth.
-        loops: pairs of images of accepted loops.
-        view: of the map, or None without one.
-        metrics: of the run; None reads ``metrics.json``.
+    ``depths`` are strips of images and their depth, ``loops`` pairs of images of accepted loops; without ``metrics``
+    those of the folder are read.
 
     Raises:
         RunError: a file of the folder is damaged.

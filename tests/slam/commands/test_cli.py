@@ -19,7 +19,7 @@ import pytest
 import slam
 import slam.commands.run.run
 from slam.commands.cli import main
-from slam.commands.run.request import RunRequest
+from slam.commands.run.run import RunRequest
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import read_trajectory

@@ -64,7 +64,7 @@ def run(
 
     Example: erfsfm-slam run --dataset KITTI --sequence 09
     """
-    from slam.commands.run.run import RunRequest, perform
+    from slam.commands.run import RunRequest, perform
 
     with progress_bar() as progress:
         folder = perform(RunRequest.of(**_given(context), progress=progress))
@@ -95,7 +95,7 @@ def live(
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.run import LiveRequest, run_live
+    from slam.commands.live import LiveRequest, run_live
 
     folder = run_live(LiveRequest.of(**_given(context)), lambda message: typer.echo(json.dumps(message)))
     typer.echo(f"everything in {folder.path}", err=True)

@@ -54,7 +54,7 @@ class RunLog(logging.Handler):
         super().close()
 
     def _say(self, level: int, message: str) -> None:
-        self._write(logging.LogRecord("slam.commands.run.run", level, __file__, 0, message, None, None))
+        self._write(logging.LogRecord("slam.commands.run", level, __file__, 0, message, None, None))
 
     def _write(self, record: logging.LogRecord) -> None:
         if self._file is None:

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 import slam
-import slam.commands.run.run
+import slam.commands.run
 from slam.commands.cli import main
-from slam.commands.run.run import RunRequest
+from slam.commands.run import RunRequest
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import read_trajectory
@@ -149,7 +149,7 @@ def test_an_interrupted_run_says_so(call: Call, monkeypatch: pytest.MonkeyPatch)
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(slam.commands.run.run, "perform", interrupt)
+    monkeypatch.setattr(slam.commands.run, "perform", interrupt)
     code, _, err = call("run")
     assert code == 130 and "interrupted; what was written stays" in err
 

@@ -22,7 +22,7 @@ from erfsfm.common.errors import BusyError
 from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.commands.cli import main
-from slam.commands.run.recorder import FolderRecorder
+from slam.commands.run import FolderRecorder
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
@@ -275,7 +275,7 @@ def test_a_stage_that_fails_costs_its_results(
         "loops": "slam.pipeline.run.close_loops",
         "graph": "slam.graph.pose_graph.PoseGraph.optimise",
         "map": "slam.pipeline.run.SlamPipeline.fuse",
-        "report": "slam.commands.run.recorder.write_report",
+        "report": "slam.commands.run.write_report",
     }
     monkeypatch.setattr(place[stage], failing)
     words = ["--dataset", quick["dataset"], "--weights", quick["weights"], "--frames", "0:8"]

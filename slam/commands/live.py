@@ -16,9 +16,8 @@ import numpy as np
 from erfsfm.common.files import FolderLock
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.signals import raising_on_termination
-from slam.commands.live.source import Source, open_source
-from slam.commands.run.recorder import FolderRecorder
-from slam.commands.run.run import Request, provenance_of, record
+from slam.commands.run import FolderRecorder, Request, provenance_of, record
+from slam.commands.source import Source, open_source
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics
@@ -68,7 +67,7 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         emit: called with every message.
 
     Raises:
-        SlamError, ErfsfmError: one line; as ``slam.commands.run.run.run_slam``.
+        SlamError, ErfsfmError: one line; as ``slam.commands.run.run_slam``.
     """
     with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
         if request.output is not None:

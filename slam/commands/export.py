@@ -167,9 +167,25 @@ def _trajectory(folder: RunFolder, up: str) -> Trajectory:
 def _model_points(
     places: Places, R_up_world: FloatArray, cloud: Ply | None, at_most: int | None
 ) -> tuple[FloatArray, NDArray[np.uint8], Sightings]:
-    """Points ``(P, 3)`` of a model and their colours: corners tracked through the images, then the cloud of the map."""
-    points, sightings = _tracked(places, at_most)
-    points = points @ R_up_world.T
+    """Points ``(P, 3)`` of a model and their colours: corners tracked through the images, then the cloud of the map.
+
+    Of more than ``at_most`` those with the longest tracks are taken.
+    """
+    points, sightings = np.zeros((0, 3)), Sightings.none()
+    if places.views:
+        structure = PlaceStructure(places, OF_KEYFRAMES)
+        tracks = structure.tracks()
+        length = np.bincount(tracks.point, minlength=len(tracks.points))
+        is_known = np.isfinite(tracks.points).all(axis=1)
+        chosen = np.argsort(np.where(is_known, -length, 1), kind="stable")[: int(is_known.sum())][:at_most]
+        number = np.full(len(tracks.points), -1)
+        number[chosen] = np.arange(len(chosen))
+        kept = number[tracks.point] >= 0
+        views, corners = tracks.views[kept], tracks.corners[kept]
+        frames = np.array([view.index for view in places.views], np.intp)[views]
+        pixels, errors_px = structure.pixels(views, corners), tracks.errors_px[kept]
+        points = tracks.points[chosen] @ R_up_world.T
+        sightings = Sightings(frames, pixels, number[tracks.point[kept]], errors_px)
     colours = np.full((len(points), 3), _GREY, np.uint8)
     if cloud is not None:
         if len(points):
@@ -206,24 +222,6 @@ def _write_scene(
     scene["frames"] = [{"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()]
     text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
     write_atomically(output / TRANSFORMS, lambda file: file.write_text(text, encoding="utf-8"), RunError)
-
-
-def _tracked(places: Places, at_most: int | None) -> tuple[FloatArray, Sightings]:
-    """Points of corners ``(P, 3)`` in the axes of the run, at most as many as wanted, the longest tracks first."""
-    if not places.views:
-        return np.zeros((0, 3)), Sightings.none()
-    structure = PlaceStructure(places, OF_KEYFRAMES)
-    tracks = structure.tracks()
-    length = np.bincount(tracks.point, minlength=len(tracks.points))
-    wanted = np.isfinite(tracks.points).all(axis=1)
-    chosen = np.argsort(np.where(wanted, -length, 1), kind="stable")[: int(wanted.sum())][:at_most]
-    number = np.full(len(tracks.points), -1)
-    number[chosen] = np.arange(len(chosen))
-    kept = number[tracks.point] >= 0
-    views, corners = tracks.views[kept], tracks.corners[kept]
-    pixels = structure.pixels(views, corners)
-    frames = np.array([view.index for view in places.views], np.intp)[views]
-    return tracks.points[chosen], Sightings(frames, pixels, number[tracks.point[kept]], tracks.errors_px[kept])
 
 
 def _write_images(

@@ -54,7 +54,7 @@ class Localisation:
     ``number`` is that of the image among those of its folder.
     """
 
-    image: str
+    image: str = ""
     T_world_camera: FloatArray | None = None
     nearest_frame: int | None = None
     inliers: int = 0
@@ -183,13 +183,13 @@ class Localiser:
         if not rows:
             return Localisation(name, reason="no place of the map is similar")
         learned = self._structure.confirms_depth(rows)
-        found = self._found(name, rows, view, learned)
+        found = self._found(rows, view, learned)
         if found.T_world_camera is None:
-            found = self._found(name, rows, view, not learned)
+            found = self._found(rows, view, not learned)
         if found.T_world_camera is None:
-            return replace(found, reason=f"{len(rows)} similar places; {found.reason}")
+            return Localisation(name, reason=f"{len(rows)} similar places; {found.reason}")
         away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
-        return replace(found, nearest_frame=self._places.views[int(away.argmin())].index)
+        return replace(found, image=name, nearest_frame=self._places.views[int(away.argmin())].index)
 
     def _view(self, image: Image) -> View:
         camera = self._intrinsics
@@ -204,41 +204,32 @@ class Localiser:
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
-    def _found(self, name: str, rows: list[int], view: View, learned: bool) -> Localisation:
+    def _found(self, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
         starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
         starts.sort(key=lambda start: len(start[1]), reverse=True)
-        found = [self._refined(name, start, rows, view, learned) for start in starts[:_STARTS]]
-        nowhere = Localisation(name, reason="no place has corners that fit one pose")
+        found = [self._refined(T_camera_world, rows, view, learned) for T_camera_world, _ in starts[:_STARTS]]
+        nowhere = Localisation(reason="no place has corners that fit one pose")
         return max(found, key=lambda each: each.inliers, default=nowhere)
 
-    def _refined(
-        self,
-        name: str,
-        start: tuple[FloatArray, NDArray[np.intp]],
-        rows: list[int],
-        view: View,
-        learned: bool,
-    ) -> Localisation:
+    def _refined(self, T_camera_world: FloatArray, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose by all corners of the map around a first one; or why it is none."""
-        T_camera_world, _ = start
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
             if len(points) < self._thresholds.min_inliers:
-                return Localisation(name, reason=f"only {len(points)} corners agree")
+                return Localisation(reason=f"only {len(points)} corners agree")
             pose = resect([T_camera_world], points, pixels, self._intrinsics.K)
             T_camera_world = pose.T_camera_world
         inliers = pose.residual_px < self._thresholds.reprojection_px
         count = int(inliers.sum())
         if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
-            return Localisation(name, reason=f"only {count} of {len(inliers)} corners agree")
+            return Localisation(reason=f"only {count} of {len(inliers)} corners agree")
         depth = float(np.median(apply(T_camera_world, points[inliers])[:, 2]))
         sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
         if sigma > _MOST_SIGMA:
-            reason = f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
-            return Localisation(name, reason=reason)
-        return Localisation(name, invert(T_camera_world), inliers=count)
+            return Localisation(reason=f"{count} corners agree, but give the position to {sigma:.1%} of their depth")
+        return Localisation(T_world_camera=invert(T_camera_world), inliers=count)
 
     def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]] | None:
         """The pose by one place, as `consensus` gives it."""

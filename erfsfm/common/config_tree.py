@@ -36,9 +36,6 @@ def load_config(
         file_or_name: a YAML file, or the name of one in a shipped folder; None for the defaults of the model.
         overrides: ``section.key=value`` each, the value in YAML; later ones win.
         shipped: folders of named configurations, the first one that has a name wins.
-
-    Raises:
-        ConfigError: one line that names the key and the file or override, what came and what is allowed.
     """
     tree: dict[str, Any] = {}
     origin = "the defaults"
@@ -168,11 +165,7 @@ class YamlError(ConfigError):
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML file; None where it is empty.
-
-    Raises:
-        YamlError: missing, too large, not YAML, or a duplicate key; one line.
-    """
+    """The content of a YAML file; None where it is empty."""
     if not path.is_file():
         raise YamlError(f"{path} is not there, or not a file")
     try:

@@ -24,11 +24,7 @@ _MOST_SAID = 20_000  # bytes of its standard error that are searched for the rea
 
 @contextmanager
 def processes(work: str) -> Iterator[ProcessPoolExecutor]:
-    """As many processes as there are cores, each of one thread; after an error, what they have not begun is left.
-
-    Raises:
-        TrainingError: one of them, which ``work`` describes, was killed.
-    """
+    """As many processes as there are cores, each of one thread; after an error, what they have not begun is left."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:
         try:

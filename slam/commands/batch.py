@@ -86,11 +86,7 @@ class Outcome:
 def options_of_drives(
     weights: str | None, config: str | None, overrides: Sequence[str], frames: str | None, seed: int, device: str
 ) -> list[str]:
-    """Options of ``run`` for all drives, with paths that hold in the folder of each.
-
-    Raises:
-        SlamError, ErfsfmError: one of them is wrong whatever the recordings hold.
-    """
+    """Options of ``run`` for all drives, with paths that hold in the folder of each."""
     load_config(config, overrides)
     record_of_whole_weights(weights or "default")
     frame_range(frames or ":", EVERYTHING)
@@ -110,9 +106,6 @@ def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequenc
     """The drives of a manifest, or the named sequences of a data set, ``all`` of them every one.
 
     These ``options`` of ``run`` are for all drives; those of a manifest come after them.
-
-    Raises:
-        SlamError: no such file or sequences, or an entry that is not understood.
     """
     path = manifest_or_root
     if path.suffix.lower() != _MANIFEST or path.is_dir():
@@ -141,9 +134,6 @@ def run_drives(
         progress: is told how many have ended.
         threads: of a drive; None for the cores of this machine by the workers.
         memory_gib: that a drive may use; 0 for all.
-
-    Raises:
-        SlamError: a folder with files of others, or no such scheduler.
     """
     check_output(output, drives)
     output.mkdir(parents=True, exist_ok=True)
@@ -169,9 +159,6 @@ def spread(
     """The number and the result of each drive, as they end; the result of work that fails is its exception.
 
     One worker works here, without Dask. Drives of a worker that dies are given to another.
-
-    Raises:
-        SlamError: Dask is not installed, or no scheduler answers at this address.
     """
     if count == 1 and scheduler is None:
         for number, drive in enumerate(drives):
@@ -212,11 +199,7 @@ def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 
 
 
 def check_output(output: Path, drives: Sequence[Drive]) -> None:
-    """Check that a batch of these drives may be written to a folder.
-
-    Raises:
-        RunError: a file, or a folder of other files with the names of a summary or of a log.
-    """
+    """Check that a batch of these drives may be written to a folder."""
     if output.exists() and not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
     if CSV in {drive.name for drive in drives}:

@@ -55,11 +55,7 @@ class Board:
         return self.square_m * np.stack([column.ravel(), row.ravel(), np.zeros(row.size)], axis=1)
 
     def charuco(self) -> Any:
-        """OpenCV's ChArUco board.
-
-        Raises:
-            CalibrationError: OpenCV has no such dictionary, or it has too few markers.
-        """
+        """OpenCV's ChArUco board."""
         number = getattr(cv2.aruco, f"DICT_{self.dictionary}", None)
         if number is None or not _DICTIONARY.fullmatch(self.dictionary):
             raise CalibrationError(f"--dictionary {self.dictionary} is none of OpenCV's: write it as 5X5_100 or 4X4_50")
@@ -113,11 +109,7 @@ class Detector:
 
 
 def parse_board(text: str) -> tuple[int, int]:
-    """Columns and rows of corners from ``9x6``.
-
-    Raises:
-        CalibrationError: if the text is no such size.
-    """
+    """Columns and rows of corners from ``9x6``."""
     match = _BOARD.fullmatch(text)
     columns, rows = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(columns, rows) < _FEWEST:
@@ -147,12 +139,7 @@ class View:
 
 
 def find_views(images: ImageSource, board: Board, progress: Progress) -> list[View]:
-    """All views of a board, of a long video in every n-th image.
-
-    Raises:
-        CalibrationError: too few images show the board.
-        DataError, SequenceError: an image cannot be read.
-    """
+    """All views of a board, of a long video in every n-th image."""
     detector = Detector(board)
     step = -(-len(images) // _MOST_SEARCHED)
     frames = range(0, len(images), step)

@@ -144,11 +144,7 @@ def calibrate_camera(
 
 
 def fit_camera(views: list[View], width: int, height: int, model: Model) -> Calibration:
-    """Fit a camera to views of a board; views that fit three times worse than the median are left out.
-
-    Raises:
-        CalibrationError: the views do not determine the camera, or no camera explains them.
-    """
+    """Fit a camera to views of a board; views that fit three times worse than the median are left out."""
     found = _fit(views, width, height, model)
     good = found.errors_px <= _OUTLIER * np.median(found.errors_px)
     if not good.all():
@@ -204,11 +200,7 @@ def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: i
 
 
 def _require_determined(fit: Calibration) -> None:
-    """Refuse a camera that the views do not determine.
-
-    Raises:
-        CalibrationError: with what to do.
-    """
+    """Refuse a camera that the views do not determine."""
     advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
     steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
     faults = {

@@ -49,9 +49,6 @@ def download_kitti(
 
     Returns:
         The number of files.
-
-    Raises:
-        DownloadError: one line; files that are whole stay.
     """
     if not _NAME.fullmatch(sequence) or int(sequence) >= _SEQUENCES:
         raise DownloadError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")
@@ -88,11 +85,7 @@ class _RemoteZip:
         self._archive = self._open()
 
     def matching(self, *prefixes: str) -> list[zipfile.ZipInfo]:
-        """Files whose names begin with one of the prefixes, in the order in which they are stored.
-
-        Raises:
-            DownloadError: there are none, or a name leads out of the folder.
-        """
+        """Files whose names begin with one of the prefixes, in the order in which they are stored."""
         members = [m for m in self._archive.infolist() if m.filename.startswith(prefixes) and not m.is_dir()]
         if not members:
             raise DownloadError(f"{self.url} has no {' or '.join(prefixes)}: check the name of the sequence")
@@ -103,11 +96,7 @@ class _RemoteZip:
         return sorted(members, key=lambda member: member.header_offset)
 
     def fetch(self, member: zipfile.ZipInfo, folder: Path) -> None:
-        """Write one member under a folder; one that is there with the same size and CRC stays.
-
-        Raises:
-            DownloadError: the connection broke, the CRC is wrong, or the file cannot be written.
-        """
+        """Write one member under a folder; one that is there with the same size and CRC stays."""
         path = folder / member.filename
         if not _is_whole(path, member):
             path.parent.mkdir(parents=True, exist_ok=True)

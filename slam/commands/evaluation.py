@@ -110,9 +110,6 @@ def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
     Args:
         words: each a path, whose system has the name of the file or folder, or ``NAME=PATH``, where PATH may be a
             pattern (``orb=runs/orb_*.txt``); all paths of one NAME are of one system.
-
-    Raises:
-        RunError: a pattern that no file fits.
     """
     found: list[tuple[str, Path]] = []
     for word in words:
@@ -130,11 +127,7 @@ def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
 
 
 def trajectory_at(path: Path, format: str = "auto", of_run: str = "optimised") -> Trajectory:
-    """A trajectory file, or one of the trajectories of a run folder.
-
-    Raises:
-        SlamError: it cannot be read, or the run has none.
-    """
+    """A trajectory file, or one of the trajectories of a run folder."""
     if not path.is_dir():
         return read_trajectory(path, format)
     trajectory = RunFolder.open(path).trajectory(of_run)
@@ -153,9 +146,6 @@ def compare(
         reference: a trajectory file, or a run folder with a reference.
         format: of the files.
         frames: ``A:B`` of the reference, half-open; a file of B - A rows without frame numbers is of these frames.
-
-    Raises:
-        SlamError: a file cannot be read, or its poses do not belong to those of the reference.
     """
     truth = trajectory_at(reference, format, REFERENCE)
     chosen = None if frames is None else frame_range(frames, len(truth))

@@ -65,9 +65,6 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
     Args:
         request: all inputs.
         emit: called with every message.
-
-    Raises:
-        SlamError, ErfsfmError: one line; as ``slam.commands.run.run_slam``.
     """
     with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
         if request.output is not None:
@@ -124,9 +121,6 @@ class StreamedSequence(GrowingSequence):
             camera: its calibration; images are undistorted.
             most_wait_s: seconds.
             every_frame: the source waits until each image was taken.
-
-        Raises:
-            SequenceError: every frame is wanted of a source that does not wait, or the camera has another image size.
         """
         require_size(source, camera, name)
         if every_frame and not source.is_stored:

@@ -141,9 +141,6 @@ def write_localisations(path: Path, found: Sequence[Localisation]) -> None:
     """Write the poses found: as TUM, or after the number of their frame as KITTI where the name ends in ``.kitti``.
 
     The stamp, or number, is that of the image.
-
-    Raises:
-        RunError: no image was found.
     """
     poses = {each.number: each.T_world_camera for each in found if each.T_world_camera is not None}
     if not poses:
@@ -174,9 +171,6 @@ class Localiser:
         """Localise an image ``(H, W, 3)`` uint8 RGB: at similar places, then in the map around.
 
         Points of learned depth are used beside triangulated ones where both agree, else only if these are too few.
-
-        Raises:
-            SequenceError: the image has another shape than its camera.
         """
         view = self._view(image)
         rows = self._index.nearest(view, _PLACES_TRIED)
@@ -263,11 +257,7 @@ class Localiser:
 
 
 def _image_paths(images: Path) -> list[Path]:
-    """One image, or the images of a folder in their order.
-
-    Raises:
-        SequenceError: there are none.
-    """
+    """One image, or the images of a folder in their order."""
     if images.is_file():
         return [images]
     folder = image_folder(images) if images.is_dir() else None

@@ -76,11 +76,7 @@ class Grid:
 
     @classmethod
     def around(cls, points: FloatArray, resolution: float) -> Grid:
-        """The cells that points ``(P, 3)`` lie in; their borders are multiples of ``resolution``.
-
-        Raises:
-            RunError: too many cells.
-        """
+        """The cells that points ``(P, 3)`` lie in; their borders are multiples of ``resolution``."""
         # rounded, so that an edge on a border of cells does not begin another row
         low = np.floor((points[:, :2].min(axis=0) / resolution).round(_BORDER_DECIMALS))
         high = np.ceil((points[:, :2].max(axis=0) / resolution).round(_BORDER_DECIMALS))
@@ -123,9 +119,6 @@ def occupancy_grid(
     Returns:
         ``FREE``, ``OCCUPIED`` or ``UNKNOWN`` of each cell ``(H, W)``, largest y first, and x and y of the outer corner
         at the bottom left ``(2,)``.
-
-    Raises:
-        RunError: there is no ground below the cameras, or there are too many cells.
     """
     metre = 1.0 if is_metric else 1.0 / _USUAL_CAMERA_HEIGHT_M
     ground = ground_along(mesh.points, T_world_camera, _USUAL_CAMERA_HEIGHT_M * metre)
@@ -173,9 +166,6 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
         points: of the map ``(P, 3)``, z up.
         T_world_camera: poses ``(N, 4, 4)`` in the same axes.
         camera_height: a first guess, which the map then corrects.
-
-    Raises:
-        RunError: there is no map below the cameras.
     """
     chosen = moved_rows(T_world_camera, _ANCHOR_STEP * camera_height, math.inf)
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]
@@ -204,9 +194,6 @@ def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: FloatArray, reso
     """Write a grid as `occupancy_grid` gives it: ``<name>.pgm`` and, after it, ``<name>.yaml``, each atomically.
 
     ``map_server`` takes lengths for metres, whatever their ``unit`` is: a comment says so.
-
-    Raises:
-        RunError: a file cannot be written.
     """
     image = path.with_suffix(".pgm")
     content = cv2.imencode(".pgm", cells)[1].tobytes()

@@ -311,9 +311,6 @@ def record(
     """Run to the end; however that is, the folder keeps the results and the reason.
 
     The first signal to end during the pass over the frames calls ``interrupt``, by default that of the pipeline.
-
-    Raises:
-        SlamError, ErfsfmError: one line.
     """
     try:
         recorder.begin()

@@ -53,11 +53,7 @@ class FolderSource:
     is_stored = True
 
     def __init__(self, folder: Path, wait_s: float) -> None:
-        """Wait up to ``wait_s`` for the first image that can be read; it gives the size.
-
-        Raises:
-            SequenceError: none came.
-        """
+        """Wait up to ``wait_s`` for the first image that can be read; it gives the size."""
         self._folder, self.fps = folder, DEFAULT_FPS
         self._past: set[str] = set()
         self._stretch: Stretch | None = None
@@ -133,11 +129,7 @@ class VideoSource:
     """A source that OpenCV opens: a camera's number, a stream's address, or a file, played at its own speed."""
 
     def __init__(self, name: str, wait_s: float) -> None:
-        """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off.
-
-        Raises:
-            SequenceError: it cannot be opened or gives no image.
-        """
+        """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off."""
         self._name, self._wait_s = name, wait_s
         self.is_stored = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
         if Path(name).is_fifo():  # OpenCV would wait for ever
@@ -180,10 +172,6 @@ class VideoSource:
 
 
 def open_source(camera: str, wait_s: float) -> Source:
-    """A source by what the user named; its ``fps``, of files, may be set before the first image.
-
-    Raises:
-        SequenceError: it cannot be opened, or no image comes within ``wait_s``.
-    """
+    """A source by what the user named; its ``fps``, of files, may be set before the first image."""
     folder = Path(camera)
     return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera, wait_s)

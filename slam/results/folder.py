@@ -104,11 +104,7 @@ class RunFolder:
         write_tum(self.path / trajectory_file(name, "tum"), trajectory)
 
     def metrics(self) -> Metrics:
-        """The content of ``metrics.json``; without the file, the status of a killed run.
-
-        Raises:
-            RunError: the file is damaged.
-        """
+        """The content of ``metrics.json``; without the file, the status of a killed run."""
         try:
             return Metrics.read(self.path / METRICS)
         except FileNotFoundError:
@@ -141,11 +137,7 @@ class RunFolder:
         return f"<h4>{escape(title)}</h4>{table}" + "".join(f"<p>{escape(note)}</p>" for note in notes)
 
     def require(self, name: str) -> Path:
-        """The path of a file of the run.
-
-        Raises:
-            RunError: it is not there.
-        """
+        """The path of a file of the run."""
         path = self.path / name
         if not path.is_file():
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
@@ -160,11 +152,7 @@ class RunFolder:
 
 
 def check_replaced(path: Path, begin: bytes | None = None) -> None:
-    """Check what a file would replace: a file with this ``begin``, by default any trajectory.
-
-    Raises:
-        RunError: a folder, a file of a run, or one of another kind.
-    """
+    """Check what a file would replace: a file with this ``begin``, by default any trajectory."""
     if path.is_dir():
         raise RunError(f"{path} is a folder: give the name of a file to write")
     if path.name in MEANINGS and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
@@ -184,11 +172,7 @@ def _is_of_kind(path: Path, begin: bytes | None) -> bool:
 
 
 def check_output(output: Path) -> None:
-    """Check that a run may write to ``output``: it is new, empty, or holds an earlier run.
-
-    Raises:
-        RunError: it is a file, or holds files of something else.
-    """
+    """Check that a run may write to ``output``: it is new, empty, or holds an earlier run."""
     if output.is_symlink() and not output.exists():
         raise RunError(f"{output} is a link to {output.readlink()}, which is not there: choose another --output")
     if not output.exists():

@@ -227,9 +227,6 @@ def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | Non
     """The true z-depth ``(H, W)`` of a frame, 0 where unknown; None without any.
 
     Of a simulated street only every fifth ``count`` is rendered.
-
-    Raises:
-        SlamError: a depth map or a scan cannot be read.
     """
     if isinstance(sequence, SimulatedSequence) and count % _EVERY_RENDERED != 1:
         return None

@@ -29,11 +29,7 @@ _WINDOWS = "open3d.visualization"
 
 @functools.cache
 def import_open3d() -> ModuleType:
-    """Import Open3D, loading the libusb that its wheels link but do not ship.
-
-    Raises:
-        SlamError: if Open3D or libusb-package is not installed or cannot be loaded.
-    """
+    """Import Open3D, loading the libusb that its wheels link but do not ship."""
     try:
         libusb_package = importlib.import_module("libusb_package")
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
@@ -65,11 +61,7 @@ def _without_windows() -> ModuleType:
 
 
 def import_extra(extra: str) -> tuple[ModuleType, ...]:
-    """Import the modules of an optional extra of the package, in the order of `EXTRAS`.
-
-    Raises:
-        SlamError: one of them is not installed or cannot be loaded.
-    """
+    """Import the modules of an optional extra of the package, in the order of `EXTRAS`."""
     needs, modules, error_type = EXTRAS[extra]
     try:
         return tuple(importlib.import_module(name) for name in modules)
@@ -84,11 +76,7 @@ def plug_ins(group: str) -> dict[str, EntryPoint]:
 
 
 def import_plug_in(point: EntryPoint) -> Any:
-    """What an entry point names.
-
-    Raises:
-        SlamError: its package cannot be loaded.
-    """
+    """What an entry point names."""
     try:
         return point.load()
     except (ImportError, AttributeError, OSError) as error:

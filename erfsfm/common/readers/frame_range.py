@@ -30,11 +30,7 @@ class FrameRange:
 
     @staticmethod
     def parse(name: str) -> FrameRange:
-        """Read a name; raw drives lose their ``_sync``.
-
-        Raises:
-            ConfigError: brackets that hold no range, or an empty one.
-        """
+        """Read a name; raw drives lose their ``_sync``."""
         name = name.strip()
         match = _RANGED.fullmatch(name)
         if match is None:

@@ -83,11 +83,7 @@ class NumberedFiles:
 
 
 def by_number(paths: list[Path]) -> NumberedFiles:
-    """Files that KITTI names by their number alone, at least one, in order.
-
-    Raises:
-        DataError: a name is no number, or two files have the same one.
-    """
+    """Files that KITTI names by their number alone, at least one, in order."""
     for path in paths:
         if not path.stem.isdecimal():
             raise DataError(f"{path} is not named by its number ({0:0{len(paths[0].stem)}d}{path.suffix}): rename it")
@@ -98,9 +94,6 @@ def by_name(paths: list[Path]) -> NumberedFiles:
     """A user's files, at least one, in order: gaps are detected where names end in numbers that go up one by one.
 
     Names without a number at their end, stamps and every-n-th-frame numbering have no gaps.
-
-    Raises:
-        DataError: two files have the same number.
     """
     matches = [_NUMBERED.fullmatch(path.stem) for path in paths]
     numbers = [int(match["number"]) for match in matches if match is not None]

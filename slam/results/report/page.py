@@ -60,9 +60,6 @@ def write_report(
 
     ``depths`` are strips of images and their depth, ``loops`` pairs of images of accepted loops; without ``metrics``
     those of the folder are read.
-
-    Raises:
-        RunError: a file of the folder is damaged.
     """
     metrics = metrics or folder.metrics()
     said, errors = verdict(metrics), metrics.evaluated_errors()

@@ -24,6 +24,7 @@ from slam.sequences.catalogue import open_sequence
 
 Call = Callable[..., tuple[int, str, str]]
 FISHEYE = {"model": "fisheye", "distortion": (-0.02, 0.01, -0.003, 0.0005)}
+CHARUCO = {"board": Board(9, 6, 0.03, "charuco"), "width": 480, "height": 360, "camera": (390.0, 394.0, 248.0, 175.0)}
 _FINE = 2
 _TEXEL_PX = 24  # of the texture, a square
 _MARGIN = 1  # squares of white around the board
@@ -134,7 +135,7 @@ def studio_matrix(camera: CameraFile) -> list[list[float]]:
 
 @pytest.mark.parametrize(
     "lens, options",
-    [({}, []), (FISHEYE, ["--model", "fisheye"]), ({"board": Board(9, 6, 0.03, "charuco")}, ["--pattern", "charuco"])],
+    [({}, []), (FISHEYE, ["--model", "fisheye"]), (CHARUCO, ["--pattern", "charuco"])],
     ids=["opencv", "fisheye", "charuco"],
 )
 def test_a_known_camera_is_found(tmp_path: Path, calibrate: Call, lens: dict, options: list[str]) -> None:
@@ -149,7 +150,7 @@ def test_a_known_camera_is_found(tmp_path: Path, calibrate: Call, lens: dict, op
     picture = cv2.imread(str(tmp_path / "camera.png"))
     assert picture is not None and picture.shape == (500, 1300, 3) and picture.std() > 20
     sequence = open_sequence(folder, camera=tmp_path / "camera.yaml")  # run reads it
-    assert sequence.frame(0).image.shape == (270, 360, 3)
+    assert sequence.frame(0).image.shape == (studio.height, studio.width, 3)
 
 
 def test_among_the_images_the_picture_is_none_of_them(tmp_path: Path, calibrate: Call) -> None:

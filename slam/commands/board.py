@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from erfsfm.common.progress import Progress
 from slam.frames import Grey
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import CalibrationError
+from slam.runtime.errors import SlamError
 from slam.sequences.images import ImageSource
 
 Pattern = Literal["chessboard", "charuco"]
@@ -58,13 +58,11 @@ class Board:
         """OpenCV's ChArUco board."""
         number = getattr(cv2.aruco, f"DICT_{self.dictionary}", None)
         if number is None or not _DICTIONARY.fullmatch(self.dictionary):
-            raise CalibrationError(f"--dictionary {self.dictionary} is none of OpenCV's: write it as 5X5_100 or 4X4_50")
+            raise SlamError(f"--dictionary {self.dictionary} is none of OpenCV's: write it as 5X5_100 or 4X4_50")
         squares = (self.columns + 1, self.rows + 1)
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         if squares[0] * squares[1] // 2 > len(dictionary.bytesList):
-            raise CalibrationError(
-                f"dictionary {self.dictionary} has too few markers for {squares[0]}x{squares[1]} squares"
-            )
+            raise SlamError(f"dictionary {self.dictionary} has too few markers for {squares[0]}x{squares[1]} squares")
         return cv2.aruco.CharucoBoard(squares, self.square_m, self.marker_share * self.square_m, dictionary)
 
     def describe(self) -> str:
@@ -113,7 +111,7 @@ def parse_board(text: str) -> tuple[int, int]:
     match = _BOARD.fullmatch(text)
     columns, rows = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(columns, rows) < _FEWEST:
-        raise CalibrationError(
+        raise SlamError(
             f"--board {text} is no board: write the corners between its squares, 9x6 for 10 by 7 squares, 3 or more"
         )
     return columns, rows
@@ -151,7 +149,7 @@ def find_views(images: ImageSource, board: Board, progress: Progress) -> list[Vi
             views.append(_view(frame, grey, *found))
         progress("images", count, len(frames))
     if len(views) < FEWEST_VIEWS:
-        raise CalibrationError(
+        raise SlamError(
             f"{len(views)} of {len(frames)} images show the whole {board.describe()}, {FEWEST_VIEWS} are needed: take "
             "20 or more sharp images with all of the board in them, at many places and tilts; --board counts the "
             "corners between its squares"

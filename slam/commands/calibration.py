@@ -20,7 +20,7 @@ from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames
 from slam.commands.board import FEWEST_VIEWS, Board, View, chosen_views, find_views
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import CalibrationError, sequence_errors
+from slam.runtime.errors import SlamError, sequence_errors
 from slam.runtime.storage.files import write_atomically
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.images import ImageFiles, ImageSource
@@ -98,14 +98,14 @@ def calibrate_camera(
     would be one of them, ``camera.pdf``. Without ``fps`` the rate of the video is written, or 10.
 
     Raises:
-        CalibrationError: the images do not give a camera; nothing is written.
+        SlamError: the images do not give a camera; nothing is written.
         SequenceError: the images cannot be read.
     """
     if output.suffix not in (".yaml", ".yml"):
-        raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
+        raise SlamError(f"--output {output} must end in .yaml: it is the camera file that run reads")
     among_images = any(path.stem != output.stem for path in list_images(output.parent))
     picture = output.with_suffix(".pdf" if among_images else ".png")
-    refuse_foreign([output], "fx:", CalibrationError)  # any camera file may be calibrated again
+    refuse_foreign([output], "fx:", SlamError)  # any camera file may be calibrated again
     require_figure(picture)
     images, own_fps = _open(recording)
     views = chosen_views(find_views(images, board, progress))
@@ -128,7 +128,7 @@ def calibrate_camera(
     )
     Undistortion(camera)  # refuses a lens that cannot be undistorted
     text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
-    write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"), CalibrationError)
+    write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"))
     _write_picture(picture, fit, camera, images)
     lines = [
         f"fx {camera.fx:g}, fy {camera.fy:g} ± {100 * fit.focal_sigma:.2f} %, cx {camera.cx:g}, cy {camera.cy:g}, "
@@ -155,7 +155,7 @@ def fit_camera(views: list[View], width: int, height: int, model: Model) -> Cali
 
 def _fit(views: list[View], width: int, height: int, model: Model) -> Calibration:
     if len(views) < FEWEST_VIEWS:
-        raise CalibrationError(f"{len(views)} sharp views fit one camera, {FEWEST_VIEWS} are needed: take more images")
+        raise SlamError(f"{len(views)} sharp views fit one camera, {FEWEST_VIEWS} are needed: take more images")
     try:
         if model == "fisheye":
             return _fit_lens(views, width, height, model, _FISHEYE_FLAGS)
@@ -163,7 +163,7 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
         bent = _fit_lens(views, width, height, model, 0)
     except cv2.error as error:
         reason = " ".join(str(error.err or error).split())
-        raise CalibrationError(
+        raise SlamError(
             f"OpenCV finds no {model} camera for these views ({reason}): show the board at more places and tilts"
         ) from error
     return bent if bent.error_px < _GAIN * plain.error_px else plain
@@ -215,7 +215,7 @@ def _require_determined(fit: Calibration) -> None:
     }
     for words, is_fault in faults.items():
         if is_fault:
-            raise CalibrationError(words)
+            raise SlamError(words)
 
 
 def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: ImageSource) -> None:

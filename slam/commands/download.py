@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from erfsfm.common.progress import Progress
-from slam.runtime.errors import DownloadError
+from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import write_atomically
 
@@ -51,7 +51,7 @@ def download_kitti(
         The number of files.
     """
     if not _NAME.fullmatch(sequence) or int(sequence) >= _SEQUENCES:
-        raise DownloadError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")
+        raise SlamError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")
     archive, camera = _GREY if is_grey else _COLOUR
     home = f"dataset/sequences/{sequence}"
     wanted: list[tuple[str, tuple[str, ...]]] = [(_CALIBRATION, (f"{home}/calib.txt", f"{home}/times.txt"))]
@@ -68,9 +68,7 @@ def download_kitti(
     missing = sum(member.file_size for _, member in parts if not (folder / member.filename).is_file())
     free = shutil.disk_usage(folder).free
     if missing > free:
-        raise DownloadError(
-            f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to"
-        )
+        raise SlamError(f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to")
     for done, (source, member) in enumerate(parts, 1):
         source.fetch(member, folder)
         progress("files", done, len(parts))
@@ -88,11 +86,11 @@ class _RemoteZip:
         """Files whose names begin with one of the prefixes, in the order in which they are stored."""
         members = [m for m in self._archive.infolist() if m.filename.startswith(prefixes) and not m.is_dir()]
         if not members:
-            raise DownloadError(f"{self.url} has no {' or '.join(prefixes)}: check the name of the sequence")
+            raise SlamError(f"{self.url} has no {' or '.join(prefixes)}: check the name of the sequence")
         for member in members:
             path = PurePosixPath(member.filename)
             if path.is_absolute() or ".." in path.parts or "\\" in member.filename:
-                raise DownloadError(f"{self.url} has a member {member.filename!r} outside of its folder: not unpacked")
+                raise SlamError(f"{self.url} has a member {member.filename!r} outside of its folder: not unpacked")
         return sorted(members, key=lambda member: member.header_offset)
 
     def fetch(self, member: zipfile.ZipInfo, folder: Path) -> None:
@@ -100,7 +98,7 @@ class _RemoteZip:
         path = folder / member.filename
         if not _is_whole(path, member):
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, lambda part: self._copy(member, part), DownloadError, sync=False)
+            write_atomically(path, lambda part: self._copy(member, part), sync=False)
 
     def _copy(self, member: zipfile.ZipInfo, path: Path) -> None:
         broken = self._errors(f"{member.filename} broke off")
@@ -117,11 +115,11 @@ class _RemoteZip:
             try:
                 return remotezip.RemoteZip(self.url, session=session, **options)
             except remotezip.RangeNotSupported as error:
-                raise DownloadError(
+                raise SlamError(
                     f"{self.url}: the server gives no parts of files (HTTP ranges): fetch the whole file there"
                 ) from error
             except (zipfile.BadZipFile, ValueError) as error:
-                raise DownloadError(f"{self.url} is no zip archive ({error}): check the address") from error
+                raise SlamError(f"{self.url} is no zip archive ({error}): check the address") from error
 
     @contextmanager
     def _errors(self, what: str) -> Iterator[None]:
@@ -132,8 +130,8 @@ class _RemoteZip:
             yield
         except broken as error:
             if isinstance(error.__context__, ValueError):  # what requests says of an address without server
-                raise DownloadError(f"{self.url} is no address: give --mirror as https://HOST/FOLDER") from error
-            raise DownloadError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
+                raise SlamError(f"{self.url} is no address: give --mirror as https://HOST/FOLDER") from error
+            raise SlamError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
 
 
 def _is_whole(path: Path, member: zipfile.ZipInfo) -> bool:

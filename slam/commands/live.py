@@ -60,11 +60,7 @@ class LiveRequest(Request):
 def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
     """Track a stream until it ends, stalls, dies or is interrupted, then leave a whole run.
 
-    The first ctrl-C, SIGTERM or SIGHUP ends the stream, another one the run.
-
-    Args:
-        request: all inputs.
-        emit: called with every message.
+    Every message goes to ``emit``. The first ctrl-C, SIGTERM or SIGHUP ends the stream, another one the run.
     """
     with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
         if request.output is not None:
@@ -113,14 +109,9 @@ class StreamedSequence(GrowingSequence):
     def __init__(
         self, name: str, source: Source, camera: CameraFile, most_wait_s: float, every_frame: bool = False
     ) -> None:
-        """Prepare to read; the thread begins with the first frame.
+        """``source`` is read from the first frame on until it sends nothing for ``most_wait_s``.
 
-        Args:
-            name: of the sequence.
-            source: is read until it sends nothing for ``most_wait_s``.
-            camera: its calibration; images are undistorted.
-            most_wait_s: seconds.
-            every_frame: the source waits until each image was taken.
+        With ``every_frame`` it waits until each image was taken.
         """
         require_size(source, camera, name)
         if every_frame and not source.is_stored:

@@ -153,12 +153,7 @@ class Localiser:
     """Localises single images among the places of one run; no network is used."""
 
     def __init__(self, places: Places, intrinsics: Intrinsics | None = None) -> None:
-        """Index the places.
-
-        Args:
-            places: of an old run, at least one view.
-            intrinsics: of the new images; None for those of the run, with images resized to it.
-        """
+        """``intrinsics`` are of the new images; without any they are resized to those of the run."""
         self._places = places
         self._thresholds = replace(OF_FRAMES, max_hamming=OF_KEYFRAMES.max_hamming)
         self._resizes = intrinsics is None

@@ -160,12 +160,9 @@ def samples(mesh: Ply, resolution: float) -> Iterator[tuple[FloatArray, FloatArr
 
 
 def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: float) -> Ground:
-    """Fit the ground.
+    """The ground by points of the map ``(P, 3)``, z up, under cameras ``(N, 4, 4)`` in the same axes.
 
-    Args:
-        points: of the map ``(P, 3)``, z up.
-        T_world_camera: poses ``(N, 4, 4)`` in the same axes.
-        camera_height: a first guess, which the map then corrects.
+    ``camera_height`` is a first guess, which the map then corrects.
     """
     chosen = moved_rows(T_world_camera, _ANCHOR_STEP * camera_height, math.inf)
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]

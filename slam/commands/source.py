@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,18 +33,6 @@ _RETRY_S = 0.2  # until a stream that is not there is tried again
 _WRITING_S = 1.0  # that an image may take to be written
 
 logger = logging.getLogger(__name__)
-
-
-class Source(Protocol):
-    """Images as they come, each with its stamp in seconds; ``is_stored`` where they wait to be read."""
-
-    width: int
-    height: int
-    fps: float
-    is_stored: bool
-
-    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
-        """All images until the source ends or ``stopped`` is set; ``SequenceError`` where it dies."""
 
 
 class FolderSource:
@@ -169,6 +157,10 @@ class VideoSource:
     def _next(self) -> Image | None:
         read, image = self._capture.read()
         return np.ascontiguousarray(image[..., ::-1]) if read and image is not None else None
+
+
+Source = FolderSource | VideoSource
+"""Images as they come, each with its stamp in seconds; ``is_stored`` where they wait to be read."""
 
 
 def open_source(camera: str, wait_s: float) -> Source:

@@ -10,18 +10,14 @@ from threading import Thread
 from types import ModuleType
 from typing import Any
 
-from slam.runtime.errors import DownloadError, SequenceError, SlamError
+from slam.runtime.errors import SlamError
 
-# of each optional extra: what needs it, its modules, and the error where one of them cannot be loaded
-EXTRAS: dict[str, tuple[str, tuple[str, ...], type[SlamError]]] = {
-    "cluster": ("several workers and schedulers need Dask", ("distributed",), SlamError),
-    "download": (
-        "download needs remotezip and requests",
-        ("remotezip", "requests", "urllib3.exceptions"),
-        DownloadError,
-    ),
-    "rerun": ("--rerun and --view need rerun", ("rerun",), SlamError),
-    "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys"), SequenceError),
+# of each optional extra: what needs it, and its modules
+EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "cluster": ("several workers and schedulers need Dask", ("distributed",)),
+    "download": ("download needs remotezip and requests", ("remotezip", "requests", "urllib3.exceptions")),
+    "rerun": ("--rerun and --view need rerun", ("rerun",)),
+    "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")),
 }
 
 _WINDOWS = "open3d.visualization"
@@ -62,11 +58,11 @@ def _without_windows() -> ModuleType:
 
 def import_extra(extra: str) -> tuple[ModuleType, ...]:
     """Import the modules of an optional extra of the package, in the order of `EXTRAS`."""
-    needs, modules, error_type = EXTRAS[extra]
+    needs, modules = EXTRAS[extra]
     try:
         return tuple(importlib.import_module(name) for name in modules)
     except (ImportError, OSError) as error:
-        raise error_type(f"{needs} ({error}): pip install 'erfsfm-slam[{extra}]'") from error
+        raise SlamError(f"{needs} ({error}): pip install 'erfsfm-slam[{extra}]'") from error
 
 
 @functools.cache

@@ -261,11 +261,7 @@ def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> Non
 
 def test_doctor(call: Call, kitti_root: Path) -> None:
     code, out, _ = call("doctor", "--dataset", kitti_root)
-    assert code == 0
-    assert all(line.split()[0] in ("ok", "missing") for line in out.splitlines())
-    assert "sequence sim: 14 frames" in out
-    assert call("doctor")[0] == 0  # no data set was named
-
+    assert code == 0 and "sequence sim: 14 frames" in out
     code, out, _ = call("doctor", "--dataset", "nowhere")
     assert code == 1 and "nowhere" in out.splitlines()[-1]
     code, out, _ = call("doctor", "--dataset", kitti_root, "--camera", "fov=700")

@@ -30,11 +30,3 @@ def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alo
         "INFO slam.commands.run: 9 times: no road",
     ]
     assert "no space" not in caplog.text
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_full_disk_loses_lines_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    with run_log() as log:
-        log.begin(Path("/dev/full"))
-        LOGGER.info("lost")
-    assert capsys.readouterr() == ("", "")

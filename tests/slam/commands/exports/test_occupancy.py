@@ -13,7 +13,7 @@ from meshes import coloured_ply
 
 from slam.commands.cli import app
 from slam.commands.export import export
-from slam.commands.occupancy import FREE, OCCUPIED, UNKNOWN, ground_along, occupancy_grid, write_ros_map
+from slam.commands.occupancy import FREE, OCCUPIED, UNKNOWN, ground_along, occupancy_grid
 from slam.formats.ply import Ply
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -141,31 +141,15 @@ def test_large_triangles_leave_no_holes(street: tuple[Ply, FloatArray]) -> None:
     assert (values[-(rows + 150) : -rows] == FREE).mean() > 0.985  # the border cells are cut by the edge
 
 
-def test_files_are_those_of_the_map_server(tmp_path: Path) -> None:
-    cells = np.full((5, 4), UNKNOWN, np.uint8)
-    cells[0, 3], cells[4, 0] = OCCUPIED, FREE
-    write_ros_map(tmp_path / "a: map.yaml", cells, np.array([-1.5, 2.25]), 0.05, "metres")
-    described = yaml.safe_load((tmp_path / "a: map.yaml").read_text())
-    assert described == {
-        "image": "a: map.pgm",
-        "resolution": 0.05,
-        "origin": [-1.5, 2.25, 0.0],
-        "negate": 0,
-        "occupied_thresh": 0.65,
-        "free_thresh": 0.196,
-    }
-    image = cv2.imread(str(tmp_path / described["image"]), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(image, cells)
-    occupied = (255 - image.astype(float)) / 255  # as map_server reads a pixel
-    assert (occupied > described["occupied_thresh"]).sum() == 1 and (occupied < described["free_thresh"]).sum() == 1
-
-
 @pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
 def test_the_grid_of_a_run(make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str) -> None:
     written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", resolution=0.2)
     assert sorted(path.name for path in written.parent.iterdir()) == ["map.pgm", "map.yaml"]
-    assert written.name == "map.yaml" and yaml.safe_load(written.read_text())["origin"] == [0.0, 2.0, 0.0]
-    cells = cv2.imread(str(tmp_path / "new" / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    described = yaml.safe_load(written.read_text())
+    as_map_server = {"occupied_thresh": 0.65, "free_thresh": 0.196, "negate": 0}
+    place = {"image": "map.pgm", "resolution": 0.2, "origin": [0.0, 2.0, 0.0]}
+    assert written.name == "map.yaml" and described == place | as_map_server
+    cells = cv2.imread(str(written.with_name(described["image"])), cv2.IMREAD_UNCHANGED)
     assert cells.shape == (15, 10) and (cells == FREE).mean() > 0.9
 
 

@@ -25,7 +25,7 @@ pytest.importorskip("rosbags")
 
 from rosbags.typesys import Stores, get_typestore
 
-NODE = Path(__file__).parents[4] / "tools" / "ros2" / "slam_node.py"
+NODE = Path(__file__).parents[3] / "tools" / "ros2" / "slam_node.py"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 FRAMES, FIRST_S = 12, 1_700_000_000
 MESSAGES = {

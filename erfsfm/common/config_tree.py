@@ -29,13 +29,10 @@ def load_config(
     overrides: Sequence[str],
     shipped: Sequence[Path],
 ) -> M:
-    """Read a configuration and change some of its keys.
+    """Read a YAML file, or one of the ``shipped`` folders by its name; None for the defaults of the ``model``.
 
-    Args:
-        model: what the configuration must be.
-        file_or_name: a YAML file, or the name of one in a shipped folder; None for the defaults of the model.
-        overrides: ``section.key=value`` each, the value in YAML; later ones win.
-        shipped: folders of named configurations, the first one that has a name wins.
+    Overrides are ``section.key=value``, the value in YAML; of two folders and of two overrides the first and the last
+    one counts. What is wrong is one line that names the key, where it is from, what came and what is allowed.
     """
     tree: dict[str, Any] = {}
     origin = "the defaults"

@@ -32,12 +32,8 @@ FIGURE_SUFFIXES = tuple(_FIGURE_METADATA)
 def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = True) -> None:
     """Let ``fill`` write a temporary file beside ``path``, then rename it; missing parent folders are made.
 
-    The temporary name ends as ``path`` does, for writers that look at the suffix.
-
-    Args:
-        path: the file to write or replace.
-        fill: writes the file that it is given.
-        sync: wait until the disk holds the content before it gets its name; a disk that fills up late is found then.
+    The temporary name ends as ``path`` does, for writers that look at the suffix. With ``sync`` the disk holds the
+    content before it gets its name; a disk that fills up late is found then.
 
     Raises:
         OSError: the file cannot be written, or is a folder, a device or a pipe; what was at ``path`` is unchanged.
@@ -62,11 +58,7 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
 
 
 def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) -> None:
-    """Refuse to replace files none of which has ``mark`` in it, by which a program knows its own.
-
-    Raises:
-        OneLineError: of the given kind.
-    """
+    """Refuse to replace files none of which has ``mark`` in it, by which a program knows its own."""
 
     def is_foreign(path: Path) -> bool:
         try:
@@ -80,23 +72,14 @@ def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) 
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The content of a file that has no more than ``most`` bytes; also of a pipe.
-
-    Raises:
-        OSError: it cannot be read, or is larger.
-    """
+    """The content of a file, or pipe, that has no more than ``most`` bytes; else an ``OSError``."""
     if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
         return content
     raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", str(path))
 
 
 def read_text(path: Path, encoding: str = "utf-8-sig", most: int = MAX_TEXT_BYTES) -> str:
-    """A text file with the line ends of any system, and without the byte order mark of some editors.
-
-    Raises:
-        OSError: as `read_bytes`.
-        UnicodeDecodeError: another encoding.
-    """
+    """A text file with the line ends of any system, and without the byte order mark of some editors."""
     text = read_bytes(path, most).decode(encoding)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -108,11 +91,7 @@ def unfinished_name(path: Path) -> str | None:
 
 
 def require_figure(path: Path) -> None:
-    """Check that a figure may be written there, before it is drawn.
-
-    Raises:
-        ConfigError: another format, or a file that no figure of ours is.
-    """
+    """Check that a figure may be written there, before it is drawn."""
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         raise ConfigError(f"figures are written as {', '.join(FIGURE_SUFFIXES)}; got '{path.name}'")
     refuse_foreign([path], _FIGURE_MARK, ConfigError)

@@ -32,12 +32,7 @@ NO_DATA_SET = (
 
 
 def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
-    """Check the installation; one line for each finding, each starting with ``ok`` or ``missing``.
-
-    Args:
-        dataset: a data set to check; None for ``$KITTI_ODOMETRY``, if it is set.
-        camera: a ``camera.yaml`` in place of its own, or ``fov=DEGREES``.
-    """
+    """Check the installation and a data set, else ``$KITTI_ODOMETRY``; lines begin with ``ok`` or ``missing``."""
     lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
     reinstall = "; run make setup, or pip install --force-reinstall {}"
     lines += [_checked(name, partial(_package, name), reinstall.format(name)) for name in (*LOOKED_UP, *IMPORTED)]

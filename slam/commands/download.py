@@ -43,12 +43,8 @@ def download_kitti(
         sequence: ``00`` to ``21``; poses are public of the first eleven.
         folder: gets ``dataset/sequences/NN`` and ``dataset/poses/NN.txt``.
         server: address of the folder of the archives.
-        is_grey: the grey camera instead of the colour camera.
-        with_scans: LiDAR as well.
-        progress: is told how many files are there.
-
-    Returns:
-        The number of files.
+        is_grey, with_scans: the grey camera instead of the colour camera; LiDAR as well.
+        progress: is told how many of the files, whose number is returned, are there.
     """
     if not _NAME.fullmatch(sequence) or int(sequence) >= _SEQUENCES:
         raise SlamError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")

@@ -162,9 +162,8 @@ def stretch_of(places: Sequence[T], read: Callable[[T], NDArray[Any]]) -> Stretc
 def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:
     """The first readable image, and its place: of three, one of the size of most.
 
-    Args:
-        places: of images of one size, as a rule: recorders and people put another picture in front.
-        read: one of them, or a one-line error.
+    Images have one size as a rule: recorders and people put another picture in front. Where ``read`` refuses all, its
+    error for the first is raised.
     """
     found: dict[tuple[int, ...], tuple[T, Image]] = {}
     for place in places:

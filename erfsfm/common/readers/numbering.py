@@ -59,13 +59,9 @@ class NumberedFiles:
         return f"{match['prefix']}{number:0{len(match['number'])}d}{path.suffix}"
 
     def rows_of(self, values: int) -> tuple[NDArray[np.intp], int] | None:
-        """Which rows a file beside these describes.
+        """Which rows a file beside these describes, and how many of its first ``values`` belong to none of them.
 
-        Args:
-            values: how many it has: one for each number from 0, one for each row, or one for each file.
-
-        Returns:
-            The rows, and how many of its first values belong to none of them; None where the count fits nothing.
+        It has one for each number from 0, for each row, or for each file; None where the count fits nothing.
         """
         if values in (len(self), self.first + len(self)):
             return np.arange(len(self)), values - len(self)

@@ -102,7 +102,7 @@ class Grid:
     def centres(self, cells: NDArray[np.int64]) -> FloatArray:
         """Centres ``(C, 2)`` of cells by their flat numbers."""
         row, column = np.divmod(cells, self.width)
-        return (self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution
+        return np.asarray((self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution, np.float64)
 
 
 def occupancy_grid(

@@ -70,40 +70,35 @@ class Board:
         return f"{self.columns}x{self.rows} {self.pattern}"
 
 
-class Detector:
-    """Finds the corners of a board in grey images."""
+def found_corners(grey: Grey, board: Board, detector: Any) -> tuple[FloatArray, FloatArray] | None:
+    """Corners ``(N, 2)`` in pixels and on the board ``(N, 3)`` in metres; None where the board is not found.
 
-    def __init__(self, board: Board) -> None:
-        self._board = board
-        beside_marker = (1 - board.marker_share) / 2
-        self._window = _WINDOW if board.pattern == "chessboard" else min(_WINDOW, beside_marker)
-        self._charuco = cv2.aruco.CharucoDetector(board.charuco()) if board.pattern == "charuco" else None
+    A chessboard is found only as a whole; of a ChArUco board, by its ``detector``, 12 corners will do, not all in one
+    line.
+    """
+    corners_m = board.corners_m
+    if detector is None:
+        size, normalised = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE
+        is_found, pixels = cv2.findChessboardCornersSB(grey, size, flags=normalised)
+        return (_refined(grey, pixels, _WINDOW), corners_m) if is_found else None
+    pixels, numbers, *_ = detector.detectBoard(grey)
+    if numbers is None or len(numbers) < _LEAST_CHARUCO:
+        return None
+    corners_m = corners_m[np.asarray(numbers).ravel()]
+    if np.linalg.matrix_rank(corners_m - corners_m.mean(axis=0)) < 2:
+        return None
+    beside_marker = (1 - board.marker_share) / 2
+    return _refined(grey, pixels, min(_WINDOW, beside_marker)), corners_m
 
-    def find(self, grey: Grey) -> tuple[FloatArray, FloatArray] | None:
-        """Corners ``(N, 2)`` in pixels and on the board ``(N, 3)`` in metres; None where the board is not found.
 
-        A chessboard is found only as a whole; of a ChArUco board 12 corners will do, not all in one line.
-        """
-        if self._charuco is not None:
-            pixels, numbers, *_ = self._charuco.detectBoard(grey)
-            if numbers is None or len(numbers) < _LEAST_CHARUCO:
-                return None
-            corners_m = self._board.corners_m[np.asarray(numbers).ravel()]
-            if np.linalg.matrix_rank(corners_m - corners_m.mean(axis=0)) < 2:
-                return None
-            return self._refined(grey, pixels), corners_m
-        size = (self._board.columns, self._board.rows)
-        is_found, pixels = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-        return (self._refined(grey, pixels), self._board.corners_m) if is_found else None
-
-    def _refined(self, grey: Grey, pixels: Any) -> FloatArray:
-        """Corners ``(N, 2)`` where the gradients around them meet: three times closer than the search finds them."""
-        corners = np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2)
-        nearest = float(pdist(corners[:, 0]).min())
-        half = int(np.clip(self._window * nearest, 2, _MOST_HALF_WINDOW_PX))
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
-        refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
-        return np.asarray(refined, np.float64).reshape(-1, 2)
+def _refined(grey: Grey, pixels: Any, window: float) -> FloatArray:
+    """Corners ``(N, 2)`` where the gradients around them meet: three times closer than the search finds them."""
+    corners = np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2)
+    nearest = float(pdist(corners[:, 0]).min())
+    half = int(np.clip(window * nearest, 2, _MOST_HALF_WINDOW_PX))
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
+    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
+    return np.asarray(refined, np.float64).reshape(-1, 2)
 
 
 def parse_board(text: str) -> tuple[int, int]:
@@ -138,13 +133,13 @@ class View:
 
 def find_views(images: ImageSource, board: Board, progress: Progress) -> list[View]:
     """All views of a board, of a long video in every n-th image."""
-    detector = Detector(board)
+    detector = cv2.aruco.CharucoDetector(board.charuco()) if board.pattern == "charuco" else None
     step = -(-len(images) // _MOST_SEARCHED)
     frames = range(0, len(images), step)
     views = []
     for count, frame in enumerate(frames, start=1):
         grey = np.asarray(cv2.cvtColor(images.read(frame), cv2.COLOR_RGB2GRAY), np.uint8)
-        found = detector.find(grey)
+        found = found_corners(grey, board, detector)
         if found is not None:
             views.append(_view(frame, grey, *found))
         progress("images", count, len(frames))

@@ -145,12 +145,26 @@ def calibrate_camera(
 
 def fit_camera(views: list[View], width: int, height: int, model: Model) -> Calibration:
     """Fit a camera to views of a board; views that fit three times worse than the median are left out."""
-    found = _fit(views, width, height, model)
-    good = found.errors_px <= _OUTLIER * np.median(found.errors_px)
+    fit = _fit(views, width, height, model)
+    good = fit.errors_px <= _OUTLIER * np.median(fit.errors_px)
     if not good.all():
-        found = _fit([view for view, is_good in zip(views, good, strict=True) if is_good], width, height, model)
-    _require_determined(found)
-    return found
+        fit = _fit([view for view, is_good in zip(views, good, strict=True) if is_good], width, height, model)
+    advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
+    steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
+    faults = {
+        f"all {len(fit.views)} views are frontal (tilts under {steepest:.0f} degrees): they do not determine the focal "
+        f"length; {advice}": steepest < _LEAST_TILT_DEG,
+        f"the reprojection error is {fit.error_px:.2f} pixels, {most_error:.1f} at most: is the board flat, --board "
+        f"right, and --model {fit.model} that of the lens?": fit.error_px > most_error,
+        f"the views leave the focal length uncertain by {100 * fit.focal_sigma:.1f} %, at most "
+        f"{100 * _MOST_FOCAL_SIGMA:.1f} %: {advice}": not fit.focal_sigma <= _MOST_FOCAL_SIGMA,
+        f"the board was seen in {100 * fit.covered:.0f} % of the image alone, {100 * _LEAST_COVERED:.0f} % at least: "
+        f"the lens is not determined elsewhere; {advice}": fit.covered < _LEAST_COVERED,
+    }
+    for words, is_fault in faults.items():
+        if is_fault:
+            raise SlamError(words)
+    return fit
 
 
 def _fit(views: list[View], width: int, height: int, model: Model) -> Calibration:
@@ -197,25 +211,6 @@ def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: i
     inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
     sigma = float(np.sqrt(max(variance * inverse[:2, :2].mean(), 0.0))) / (0.5 * (K[0, 0] + K[1, 1]))
     return Calibration(model, width, height, np.asarray(K), distortion, views, residuals, T_camera_board, sigma)
-
-
-def _require_determined(fit: Calibration) -> None:
-    """Refuse a camera that the views do not determine."""
-    advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
-    steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
-    faults = {
-        f"all {len(fit.views)} views are frontal (tilts under {steepest:.0f} degrees): they do not determine the focal "
-        f"length; {advice}": steepest < _LEAST_TILT_DEG,
-        f"the reprojection error is {fit.error_px:.2f} pixels, {most_error:.1f} at most: is the board flat, --board "
-        f"right, and --model {fit.model} that of the lens?": fit.error_px > most_error,
-        f"the views leave the focal length uncertain by {100 * fit.focal_sigma:.1f} %, at most "
-        f"{100 * _MOST_FOCAL_SIGMA:.1f} %: {advice}": not fit.focal_sigma <= _MOST_FOCAL_SIGMA,
-        f"the board was seen in {100 * fit.covered:.0f} % of the image alone, {100 * _LEAST_COVERED:.0f} % at least: "
-        f"the lens is not determined elsewhere; {advice}": fit.covered < _LEAST_COVERED,
-    }
-    for words, is_fault in faults.items():
-        if is_fault:
-            raise SlamError(words)
 
 
 def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: ImageSource) -> None:

@@ -40,11 +40,18 @@ def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
     lines += [_checked(f"weights {name}", partial(_weights, name)) for name in WEIGHTS]
     variable = os.environ.get(KITTI_VARIABLE)
     root = dataset or (Path(variable) if variable else None)
-    if root is not None:
-        return lines + _dataset(root, camera)
-    if camera is not None:
-        lines.append(f"missing  the data set of camera {camera}: give --dataset")
-    return [*lines, NO_DATA_SET]
+    if root is None:
+        no_camera = [] if camera is None else [f"missing  the data set of camera {camera}: give --dataset"]
+        return [*lines, *no_camera, NO_DATA_SET]
+    try:
+        kinds = sequence_kinds(root)
+    except SlamError as error:
+        return [*lines, f"missing  {error}"]
+    if not kinds:
+        lines.append(f"missing  {root} is not a data set of a kind that docs/recordings.md lists")
+    for name, kind in kinds.items():
+        lines.append(_checked(f"sequence {name}", partial(_sequence, root, name, kind, camera), f" ({kind})"))
+    return lines
 
 
 def _checked(part: str, describe: Callable[[], str], advice: str = "") -> str:
@@ -64,19 +71,6 @@ def _package(name: str) -> str:
 def _weights(name: str) -> str:
     record = record_of_whole_weights(name)
     return f": {record.network.depth} and {record.network.pose}, {record.licence}"
-
-
-def _dataset(root: Path, camera: Path | None) -> list[str]:
-    try:
-        kinds = sequence_kinds(root)
-    except SlamError as error:
-        return [f"missing  {error}"]
-    if not kinds:
-        return [f"missing  {root} is not a data set of a kind that docs/recordings.md lists"]
-    return [
-        _checked(f"sequence {name}", partial(_sequence, root, name, kind, camera), f" ({kind})")
-        for name, kind in kinds.items()
-    ]
 
 
 def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:

@@ -92,7 +92,8 @@ class _RemoteZip:
     def fetch(self, member: zipfile.ZipInfo, folder: Path) -> None:
         """Write one member under a folder; one that is there with the same size and CRC stays."""
         path = folder / member.filename
-        if not _is_whole(path, member):
+        is_there = path.is_file() and path.stat().st_size == member.file_size
+        if not is_there or zlib.crc32(path.read_bytes()) != member.CRC:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, lambda part: self._copy(member, part), sync=False)
 
@@ -128,16 +129,6 @@ class _RemoteZip:
             if isinstance(error.__context__, ValueError):  # what requests says of an address without server
                 raise SlamError(f"{self.url} is no address: give --mirror as https://HOST/FOLDER") from error
             raise SlamError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
-
-
-def _is_whole(path: Path, member: zipfile.ZipInfo) -> bool:
-    if not path.is_file() or path.stat().st_size != member.file_size:
-        return False
-    crc = 0
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            crc = zlib.crc32(chunk, crc)
-    return crc == member.CRC
 
 
 def _cause(error: BaseException) -> str:

@@ -195,7 +195,10 @@ class LiveRecorder(FolderRecorder):
         sequence = self._sequence
         if not sequence.waiting:
             observer.flush()
-        self._say_dropped()
+        dropped, now_s = sequence.dropped, time.monotonic()
+        if dropped > self._dropped and now_s - self._dropped_said_s >= 1.0:  # once a second
+            self._dropped, self._dropped_said_s = dropped, now_s
+            logger.warning("%d images dropped, %d measured", dropped, len(sequence))
         for newest in self._poses.add(observer):
             index, self._said = self._said, self._said + 1
             at_s = sequence.arrived_s.get(index)
@@ -230,13 +233,6 @@ class LiveRecorder(FolderRecorder):
             T_world_camera = self._poses.T_world_camera
             stamps = self._sequence.stamps[: len(T_world_camera)]
             self.folder.write_trajectory("odometry", Trajectory(stamps, T_world_camera))
-
-    def _say_dropped(self) -> None:
-        """Once a second, while more images are dropped."""
-        dropped, now_s = self._sequence.dropped, time.monotonic()
-        if dropped > self._dropped and now_s - self._dropped_said_s >= 1.0:
-            self._dropped, self._dropped_said_s = dropped, now_s
-            logger.warning("%d images dropped, %d measured", dropped, len(self._sequence))
 
 
 class Viewer:

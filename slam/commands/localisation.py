@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress, silent
-from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.camera_file import CAMERA_FILE
 from erfsfm.common.readers.images import image_folder, list_images, read_image
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
@@ -99,7 +99,11 @@ def localise(
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
-    own_camera = _camera_file(camera, images, paths)
+    if camera is None:
+        folder = images if images.is_dir() else images.parent
+        own_camera = beside(paths[0].parent, folder, folder.absolute().parent)  # where ``run`` looks
+    else:
+        own_camera = explicit_camera(camera, ImageFiles(in_order(paths)))
     if own_camera is None and places.intrinsics.undistorted:
         raise SequenceError(
             f"{run.path} undistorted its images, and {images} has no {CAMERA_FILE}: give its --camera, which is fov=70 "
@@ -260,11 +264,3 @@ def _image_paths(images: Path) -> list[Path]:
         what = "no images in it" if images.is_dir() else "no such file or folder"
         raise SequenceError(f"{images}: {what}; give an image or a folder of png, jpg or bmp images")
     return list_images(folder)
-
-
-def _camera_file(explicit: Path | None, images: Path, paths: list[Path]) -> CameraFile | None:
-    """That of the user, or else the one that ``run`` would find."""
-    if explicit is None:
-        folder = images if images.is_dir() else images.parent
-        return beside(paths[0].parent, folder, folder.absolute().parent)
-    return explicit_camera(explicit, ImageFiles(in_order(paths)))

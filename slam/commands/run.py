@@ -58,11 +58,7 @@ _RECORDING = ("dataset", "camera", "gps", "sequence", "frames", "truth")
 
 
 class Request(Section):
-    """The inputs that every run has, as ``erfsfm-slam run --help`` explains them; from Python, a path may be text.
-
-    Attributes:
-        command: recorded in the metrics.
-    """
+    """The inputs that every run has, as ``erfsfm-slam run --help`` explains them; from Python, a path may be text."""
 
     camera: Path | None = None
     weights: NameOrPath = "default"
@@ -71,7 +67,7 @@ class Request(Section):
     output: Path | None = None
     seed: int = Field(default=0, ge=0, lt=2**31)
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    command: str = "slam.run_slam"
+    command: str = "slam.run_slam"  # recorded in the metrics
 
     @classmethod
     def of(cls, **arguments: Any) -> Self:
@@ -98,11 +94,7 @@ class Request(Section):
 
 
 class RunRequest(Request):
-    """Also the recording and what is written of it; without ``dataset`` and ``sequence`` the embedded street.
-
-    Attributes:
-        progress: called with (stage, done, total).
-    """
+    """Also the recording and what is written of it; without ``dataset`` and ``sequence`` the embedded street."""
 
     dataset: Path | None = None
     sequence: str | None = None
@@ -110,7 +102,7 @@ class RunRequest(Request):
     truth: Path | None = None
     rerun: Path | None = None
     gps: Path | None = None
-    progress: Progress = silent
+    progress: Progress = silent  # called with (stage, done, total)
 
 
 class FolderRecorder(Recorder):
@@ -250,13 +242,7 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
 
     Without ``progress``, the log says every ten seconds (level INFO) what is done; in a notebook its cell does.
 
-    Args:
-        dataset: as in `RunRequest`.
-        sequence: as in `RunRequest`.
-        options: the others of `RunRequest`, by name.
-
-    Returns:
-        The run folder.
+    The arguments are those of `RunRequest`, by name; the run folder is returned.
 
     Raises:
         TypeError: an unknown argument.

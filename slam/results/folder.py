@@ -62,7 +62,7 @@ class RunFolder:
             output.mkdir(parents=True, exist_ok=True)
             # last of all the file by which it is known as a run
             for path in sorted(output.iterdir(), key=lambda path: path.name == METRICS):
-                if path.name in MEANINGS or _is_rest(path):
+                if path.name in MEANINGS or unfinished_name(path) in MEANINGS:
                     path.unlink()
             return cls(output)
         except OSError as error:
@@ -179,7 +179,7 @@ def check_output(output: Path) -> None:
         return
     if not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
-    if not _is_run(output / METRICS) and any(not _is_rest(path) for path in output.iterdir()):
+    if not _is_run(output / METRICS) and any(unfinished_name(path) not in MEANINGS for path in output.iterdir()):
         raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
 
 
@@ -204,11 +204,6 @@ def _is_run(metrics: Path) -> bool:
     except (OSError, RunError):
         return False
     return content.provenance.weights_sha256 is not None and {"schema_", "status"} <= content.model_fields_set
-
-
-def _is_rest(path: Path) -> bool:
-    """Whether it is a partial file of a killed run."""
-    return unfinished_name(path) in MEANINGS
 
 
 def _link(link: Path, target: Path) -> None:

@@ -76,8 +76,11 @@ def runs_table(runs: Sequence[RunFolder]) -> Table:
     """One row for each run and trajectory; runs that failed or were killed with the reason."""
     rows: list[list[str]] = []
     notes: dict[str, None] = {UNITS: None}
-    for name, metrics in zip(_names(runs), (run.metrics() for run in runs)):
-        errors, title = metrics.evaluated_errors(), name
+    names = [run.path.resolve().name for run in runs]
+    for run, short in zip(runs, names, strict=True):
+        title = name = str(run.path) if names.count(short) > 1 else short
+        metrics = run.metrics()
+        errors = metrics.evaluated_errors()
         if metrics.failure:
             ended = "failed" if metrics.status == "failed" else "did not end"
             title += f", {ended}"
@@ -128,9 +131,3 @@ def missing_errors(trajectories: Mapping[str, TrajectoryMetrics]) -> str:
 
 def _numbers(errors: TrajectoryMetrics) -> list[str]:
     return [written(errors.at(column.path)[0], column.decimals) for column in COLUMNS]
-
-
-def _names(runs: Sequence[RunFolder]) -> list[str]:
-    """Short names of runs: the folder's own, or the whole path where it is not unique."""
-    names = [run.path.resolve().name for run in runs]
-    return [str(run.path) if names.count(name) > 1 else name for run, name in zip(runs, names)]

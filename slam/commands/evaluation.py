@@ -58,7 +58,8 @@ def against_reference(
         notes = [UNITS, *missing_notes({run.system: run.errors for run in runs})]
         head = ["system", "poses", *(column.name for column in COLUMNS)]
         Table(head, list(_rows(runs)), f"Errors against {reference}", notes).print()
-    _require([f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)])
+    if broken := [f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)]:
+        raise SlamError("; ".join(broken))
 
 
 def of_runs(paths: Sequence[Path], as_json: bool) -> None:
@@ -82,11 +83,7 @@ def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], 
         kind = "tum" if timed else "kitti"
         files = [path / trajectory_file(name, kind) if path.is_dir() else path for path, name in both.items()]
         typer.echo("\n".join(evo_commands(files[0], files[-1], format)))
-    _require(exceeded(run.errors, limits))
-
-
-def _require(broken: Sequence[str]) -> None:
-    if broken:
+    if broken := exceeded(run.errors, limits):
         raise SlamError("; ".join(broken))
 
 

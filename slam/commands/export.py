@@ -20,7 +20,7 @@ from erfsfm.common.progress import Progress, silent
 from slam.commands.occupancy import occupancy_grid, write_ros_map
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
-from slam.formats.trajectory import Trajectory, nearest_stamps
+from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
 from slam.frames import Intrinsics, Sequence
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -154,10 +154,7 @@ def _map(folder: RunFolder, what: str, up: str) -> Ply:
 
 def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     """The optimised trajectory in the given axes."""
-    folder.require(ESTIMATE)
-    trajectory = folder.trajectory("optimised")
-    if trajectory is None:
-        raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
+    trajectory = read_trajectory(folder.require(ESTIMATE), "tum")
     frames = folder.metrics().sequence.frames
     if frames is not None and frames != len(trajectory):
         raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")

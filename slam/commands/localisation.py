@@ -64,12 +64,12 @@ class Localisation:
     def tree(self) -> dict[str, Any]:
         """For JSON: unknown values are null, with the reason."""
         T_world_camera = self.T_world_camera
-        entry = {"image": self.image, "found": T_world_camera is not None}
+        entry: dict[str, Any] = {"image": self.image, "found": T_world_camera is not None}
         if T_world_camera is None:
-            values: dict[str, Any] = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
+            values = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
             return entry | values | {"reason": self.reason}
-        pose = {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
-        return entry | pose | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
+        entry |= {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
+        return entry | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
 
 
 def localise(

@@ -75,7 +75,7 @@ class LidarTruth:
         """The scans of a sequence with true poses."""
         self._sequence = sequence
         self.frames: Indices = np.array([k for k in range(len(sequence)) if sequence.has_scan(k)], dtype=np.int64)
-        self._limits: dict[int, tuple[float, float]] = {}
+        self._limits: dict[int, tuple[float, float]] = {}  # sines of the lowest and the highest beam
 
     def view(self, frame: int) -> Surface:
         """The points of one scan; points that project into its image are in the image."""
@@ -85,7 +85,9 @@ class LidarTruth:
         if isinstance(points, str):
             points = np.empty((0, 3))
         ranges = np.linalg.norm(points, axis=1)
-        self._limits[frame] = _elevations(points, ranges)
+        sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
+        beams = np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)  # stray points left out
+        self._limits[frame] = float(beams[0]), float(beams[1])
         points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
         return Surface(apply(sequence.reference[frame], points), _in_image(points, sequence.intrinsics))
 
@@ -112,15 +114,6 @@ def _in_image(points: FloatArray, camera: Intrinsics) -> Mask:
     pixels = camera.project(points[inside])
     inside[inside] = ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
     return inside
-
-
-def _elevations(points: FloatArray, ranges: FloatArray) -> tuple[float, float]:
-    """Sines of the lowest and the highest beam of a scan, stray points left out."""
-    sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
-    if len(sines) == 0:
-        return 1.0, -1.0
-    low, high = np.quantile(sines, [0.001, 0.999])
-    return float(low), float(high)
 
 
 def find_truth(sequence: Sequence) -> SurfaceTruth | str:

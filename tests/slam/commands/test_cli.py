@@ -235,8 +235,8 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
     run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
     assert call(*run)[0] == 0
     images = kitti_root / "sequences" / "sim" / "image_2"
-    code, out, err = call("localize", images, "--map", "run")
-    assert (code, err) == (0, "") and "of 14 images found" in out and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
+    code, out, err = call("localize", images, "--map", "run", "--frames", "11:14")
+    assert (code, err) == (0, "") and "of 3 images found" in out and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
     code, out, _ = call("localize", images / "000003.png", "--map", "run", "--json")
     assert code == 0 and [entry["image"] for entry in json.loads(out)] == ["000003.png"]
     assert call("localize", images, "--map", images)[0] == 1

@@ -170,7 +170,6 @@ def evaluate_depth(
 
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
-    from erfsfm.common.files import write_atomically
     from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.evaluation.many_view_truth import many_view_protocol
     from erfsfm.evaluation.protocols import depth_protocol
@@ -193,6 +192,13 @@ def evaluate_depth(
             rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
         else:
             rows = eigen_protocol(networks["networks"], dataset[0], split, fidelity, allow_leak)
+    _show(rows, output, as_json)
+
+
+def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
+    """Write the rows, if a file is named, and print them."""
+    from erfsfm.common.files import write_atomically
+
     if output is not None:
         write_atomically(output, lambda path: path.write_text(json.dumps(rows, indent=2) + "\n"))
     print_rows(rows if as_json else _narrow(rows), as_json)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -104,12 +105,10 @@ class FolderSource:
 
     def _first_size(self) -> tuple[int, int] | None:
         """Height and width of the first image that can be read; None while there is none."""
-        try:
+        with suppress(DataError):  # it is still being written
             if waiting := self._waiting():
                 self._stretch = stretch_of(waiting, read_values)
                 return first_size(waiting)
-        except DataError:
-            pass  # it is still being written
         return None
 
 

@@ -137,13 +137,10 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
     if isinstance(truth, str):
         return MapMetrics.unknown(truth, *_MAP_ERRORS)
     assert sequence.reference is not None
-    fits = {
-        "rigid": pose_similarity(sequence.reference, result.optimised.T_world_camera, with_scale=False),
-        "with_scale": pose_similarity(sequence.reference, result.optimised.T_world_camera),
-    }
-    unmetric = not result.scale.is_metric
-    if unmetric:
-        del fits["rigid"]
+    poses = result.optimised.T_world_camera
+    fits = {"with_scale": pose_similarity(sequence.reference, poses)}
+    if result.scale.is_metric:
+        fits["rigid"] = pose_similarity(sequence.reference, poses, with_scale=False)
     looked_at = np.concatenate([*stretches(sequence.reference, truth.frames), np.empty(0, np.int64)]).astype(np.int64)
     cameras = cKDTree(sequence.reference[looked_at, :3, 3])
     placed = {name: _placed(pieces(), fit, cameras) for name, fit in fits.items()}
@@ -156,7 +153,7 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
         return MapMetrics.unknown("no point of the true surface is known near the images", *_MAP_ERRORS)
     with_scale = placed_metrics(PlacedMetrics, distances["with_scale"], scale=fits["with_scale"].scale)
     more = {"truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
-    if unmetric:
+    if "rigid" not in fits:
         return MapMetrics.of(**dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale")), **more)
     return placed_metrics(MapMetrics, distances["rigid"], **more)
 

@@ -67,7 +67,7 @@ def write_report(
     found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
     drawn = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
     accepted = LoopsFile.read(folder.path / LOOPS).accepted or [] if (folder.path / LOOPS).is_file() else []
-    no_map = metrics.map.absent or ("" if metrics.map.triangles is not None else metrics.map.why("triangles"))
+    no_map = "" if metrics.map.triangles is not None else metrics.map.why("triangles")
     page = _TEMPLATES.get_template("page.html.j2").render(
         script=(files("slam.results.report") / "page.js").read_text("utf-8"),
         plotly=_plotly,

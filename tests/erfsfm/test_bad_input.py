@@ -98,12 +98,19 @@ def test_weights_that_are_not_finite(
     assert not (tmp_path / "depth").exists()
 
 
-def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path) -> None:
-    output, files = tmp_path / "mine", {"config.yaml": dump_yaml(load_experiment("tiny")), "notes.txt": "mine"}
-    output.mkdir()
+FOREIGN = {
+    "a note": {"notes.txt": "mine"},
+    "our configuration and a note": {"config.yaml": dump_yaml(load_experiment("tiny")), "notes.txt": "mine"},
+}
+
+
+@pytest.mark.parametrize("files", FOREIGN.values(), ids=FOREIGN.keys())
+def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path, files: dict[str, str]) -> None:
+    output = tmp_path / "mine"
     for name, text in files.items():
+        (output / name).parent.mkdir(parents=True, exist_ok=True)
         (output / name).write_text(text)
     missing = tmp_path / "missing"  # the output is looked at before the data
     error = refusal(*TRAIN, *SMALL, "--dataset", missing, "--output", output)
     assert f"{output} holds files that 'erfsfm train' did not write" in error
-    assert {path.name: path.read_text() for path in output.iterdir()} == files
+    assert {str(path.relative_to(output)): path.read_text() for path in output.rglob("*") if path.is_file()} == files

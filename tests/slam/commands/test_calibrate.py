@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
 from slam.commands.board import Board
 from slam.commands.cli import main
+from slam.frames import Intrinsics
 from slam.sequences.catalogue import open_sequence
 
 Call = Callable[..., tuple[int, str, str]]
@@ -124,13 +125,9 @@ def require_close(camera: CameraFile, studio: Studio) -> None:
     points = np.concatenate([grid, np.ones_like(grid[..., :1])], axis=-1)
     project = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
     zero = np.zeros(3)
-    found, _ = project(points, zero, zero, np.array(studio_matrix(camera)), np.array(camera.distortion))
+    found, _ = project(points, zero, zero, Intrinsics.of(camera.pinhole).K, np.array(camera.distortion))
     true, _ = project(points, zero, zero, K, np.array(studio.distortion))
     assert np.abs(found - true).max() < 0.01 * studio.width
-
-
-def studio_matrix(camera: CameraFile) -> list[list[float]]:
-    return [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import Absent, Model
 from erfsfm.common.errors import ExportError
-from erfsfm.common.files import is_foreign, write_atomically
+from erfsfm.common.files import refuse_foreign, write_atomically
 from erfsfm.common.threads import open_session
 from erfsfm.networks.presets import NetworkKind
 from erfsfm.networks.torch_network import exported
@@ -80,8 +80,7 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
     if not isinstance(model.pose_net, Absent):
         wanted.append(("pose", config.pose, pose_path(path), PoseGraph(model.pose_net), {"target": 0, "sources": 1}))
     for _, _, file, _, _ in wanted:
-        if is_foreign(file, _MARK):
-            raise ExportError(f"{file} is none of ours and would be replaced: choose another --output")
+        refuse_foreign([file], _MARK, ExportError)
     files = []
     for kind, preset, file, network, inputs in wanted:
         given = [{name: example[which] for name, which in inputs.items()} for example in examples]

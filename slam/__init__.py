@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from erfsfm import DISTRIBUTION as DISTRIBUTION
 
 if TYPE_CHECKING:
-    from slam.commands.run.run import run_slam
+    from slam.commands.run import run_slam
     from slam.config.sections import load_config
     from slam.pipeline.live import Slam
     from slam.results.folder import RunFolder
@@ -18,7 +18,7 @@ _HOMES = {
     "RunFolder": "slam.results.folder",
     "Slam": "slam.pipeline.live",
     "load_config": "slam.config.sections",
-    "run_slam": "slam.commands.run.run",
+    "run_slam": "slam.commands.run",
 }
 
 

@@ -43,7 +43,7 @@ PROGRAMS = {"erfsfm-slam": slam.commands.cli.app, "erfsfm": erfsfm.cli.app}
 # public names by the module to import them from
 INTERFACE = {
     "slam": ("run_slam", "Slam", "RunFolder"),
-    "slam.commands.run.request": ("RunRequest",),
+    "slam.commands.run": ("RunRequest",),
     "slam.config.sections": ("load_config",),
     "slam.formats.trajectory": ("Trajectory", "read_trajectory", "write_kitti", "write_tum"),
     "slam.evaluation.trajectory": ("trajectory_metrics", "align"),

@@ -29,22 +29,18 @@ def load_config(
     overrides: Sequence[str],
     shipped: Sequence[Path],
 ) -> M:
-    """Read a configuration and change some of its keys.
+    """Read a YAML file, or one of the ``shipped`` folders by its name; None for the defaults of the ``model``.
 
-    Args:
-        model: what the configuration must be.
-        file_or_name: a YAML file, or the name of one in a shipped folder; None for the defaults of the model.
-        overrides: ``section.key=value`` each, the value in YAML; later ones win.
-        shipped: folders of named configurations, the first one that has a name wins.
-
-    Raises:
-        ConfigError: one line that names the key and the file or override, what came and what is allowed.
+    Overrides are ``section.key=value``, the value in YAML; of two folders and of two overrides the first and the last
+    one counts. What is wrong is one line that names the key, where it is from, what came and what is allowed.
     """
     tree: dict[str, Any] = {}
     origin = "the defaults"
     if file_or_name is not None:
         path = find_config(file_or_name, shipped)
-        origin, tree = str(path), _read_tree(path)
+        origin, tree = str(path), read_yaml(path) or {}
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
     for text in overrides:
         _override(tree, text)
     try:
@@ -95,13 +91,6 @@ def first_problem(error: ValidationError) -> str:
     in_short = {"missing": "missing", "extra_forbidden": "unknown key"}
     said = in_short.get(first["type"], first["msg"].removeprefix("Value error, "))
     return f"{place}: {said}" if place else said
-
-
-def _read_tree(path: Path) -> dict[str, Any]:
-    tree = read_yaml(path)
-    if not isinstance(tree, dict | None):
-        raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
-    return tree or {}
 
 
 def _override(tree: dict[str, Any], text: str) -> None:
@@ -173,11 +162,7 @@ class YamlError(ConfigError):
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML file; None where it is empty.
-
-    Raises:
-        YamlError: missing, too large, not YAML, or a duplicate key; one line.
-    """
+    """The content of a YAML file; None where it is empty."""
     if not path.is_file():
         raise YamlError(f"{path} is not there, or not a file")
     try:

@@ -7,12 +7,12 @@ import fcntl
 import os
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from erfsfm.common.errors import BusyError, ConfigError
+from erfsfm.common.errors import BusyError, ConfigError, OneLineError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,12 +32,8 @@ FIGURE_SUFFIXES = tuple(_FIGURE_METADATA)
 def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = True) -> None:
     """Let ``fill`` write a temporary file beside ``path``, then rename it; missing parent folders are made.
 
-    The temporary name ends as ``path`` does, for writers that look at the suffix.
-
-    Args:
-        path: the file to write or replace.
-        fill: writes the file that it is given.
-        sync: wait until the disk holds the content before it gets its name; a disk that fills up late is found then.
+    The temporary name ends as ``path`` does, for writers that look at the suffix. With ``sync`` the disk holds the
+    content before it gets its name; a disk that fills up late is found then.
 
     Raises:
         OSError: the file cannot be written, or is a folder, a device or a pipe; what was at ``path`` is unchanged.
@@ -61,32 +57,29 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
             partial.unlink(missing_ok=True)
 
 
-def is_foreign(path: Path, mark: str) -> bool:
-    """Whether something is at ``path`` that is no file with ``mark`` in it, by which a program knows its own."""
-    try:
-        return mark.encode() not in read_bytes(path, MAX_TEXT_BYTES)
-    except OSError:  # a folder, or a larger file
-        return path.exists()
+def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) -> None:
+    """Refuse to replace files none of which has ``mark`` in it, by which a program knows its own."""
+
+    def is_foreign(path: Path) -> bool:
+        try:
+            return mark.encode() not in read_bytes(path, MAX_TEXT_BYTES)
+        except OSError:  # a folder, or a larger file
+            return True
+
+    there = [path for path in files if path.exists()]
+    if there and all(map(is_foreign, there)):
+        raise error(f"{there[0]} is none of ours and would be replaced: choose another --output")
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The content of a file that has no more than ``most`` bytes; also of a pipe.
-
-    Raises:
-        OSError: it cannot be read, or is larger.
-    """
+    """The content of a file, or pipe, that has no more than ``most`` bytes; else an ``OSError``."""
     if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
         return content
     raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", str(path))
 
 
 def read_text(path: Path, encoding: str = "utf-8-sig", most: int = MAX_TEXT_BYTES) -> str:
-    """A text file with the line ends of any system, and without the byte order mark of some editors.
-
-    Raises:
-        OSError: as `read_bytes`.
-        UnicodeDecodeError: another encoding.
-    """
+    """A text file with the line ends of any system, and without the byte order mark of some editors."""
     text = read_bytes(path, most).decode(encoding)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -98,15 +91,10 @@ def unfinished_name(path: Path) -> str | None:
 
 
 def require_figure(path: Path) -> None:
-    """Check that a figure may be written there, before it is drawn.
-
-    Raises:
-        ConfigError: another format, or a file that no figure of ours is.
-    """
+    """Check that a figure may be written there, before it is drawn."""
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         raise ConfigError(f"figures are written as {', '.join(FIGURE_SUFFIXES)}; got '{path.name}'")
-    if is_foreign(path, _FIGURE_MARK):
-        raise ConfigError(f"{path} exists and is no figure of erfsfm: choose another --output, or remove it")
+    refuse_foreign([path], _FIGURE_MARK, ConfigError)
 
 
 def save_figure(figure: Figure, path: Path, dpi: int) -> None:

@@ -24,11 +24,7 @@ _MOST_SAID = 20_000  # bytes of its standard error that are searched for the rea
 
 @contextmanager
 def processes(work: str) -> Iterator[ProcessPoolExecutor]:
-    """As many processes as there are cores, each of one thread; after an error, what they have not begun is left.
-
-    Raises:
-        TrainingError: one of them, which ``work`` describes, was killed.
-    """
+    """As many processes as there are cores, each of one thread; after an error, what they have not begun is left."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:
         try:
@@ -47,7 +43,7 @@ def slam_process(
     memory_gib: float = 0.0,
     program: Sequence[str] = ("slam",),
 ) -> str:
-    """Run ``erfsfm-slam ARGUMENTS`` with this interpreter, and wait for its end; it ends with this process.
+    """Run ``erfsfm-slam ARGUMENTS`` with this interpreter, and wait for its end; why it failed, if it did.
 
     Args:
         arguments: of the command line.
@@ -56,9 +52,6 @@ def slam_process(
         threads: of libraries; 0 as they like.
         memory_gib: where it needs more, it is ended; 0 for no limit.
         program: module that is run, with words before the arguments.
-
-    Returns:
-        Why it failed, in one line; empty where it did not.
     """
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
     with tempfile.TemporaryFile("w+b") if log is None else log.open("a+b") as said:

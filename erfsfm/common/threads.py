@@ -1,17 +1,25 @@
-"""How many threads libraries may start, and ONNX Runtime on a number of them, without importing torch."""
+"""How many threads libraries may start, ONNX Runtime on a number of them, and our own work in threads."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
+
+S = TypeVar("S")
+T = TypeVar("T")
+
+CORES = 2  # used side by side
+_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
 
 
 def usable_cores() -> int:
@@ -50,9 +58,6 @@ def limit_library_threads() -> Iterator[None]:
         yield
 
 
-_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
-
-
 def open_session(content: bytes, threads: int) -> InferenceSession:
     """A graph that is ready to run on that many threads; the exceptions of ONNX Runtime are raised as they are."""
     from onnxruntime import InferenceSession, SessionOptions
@@ -63,3 +68,24 @@ def open_session(content: bytes, threads: int) -> InferenceSession:
     options.log_severity_level = _FATAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # costly on a shared machine
     return InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def read_ahead(read: Callable[[int], T], numbers: Sequence[int], threads: int = 1) -> Generator[T, None, None]:
+    """The result of ``read`` for each number, computed in other ``threads`` while the one before is used.
+
+    They end with the numbers, or when the generator is closed. With more than one, calls must be independent.
+    """
+    with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="ahead") as ahead:
+        waiting: deque[Future[T]] = deque()
+        for number in numbers:
+            waiting.append(ahead.submit(read, number))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        for last in waiting:
+            yield last.result()
+
+
+def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
+    """The result of ``do`` for each item, in order; the calls must be independent."""
+    with ThreadPoolExecutor(max_workers=CORES, thread_name_prefix="side") as side:
+        return list(side.map(do, items))

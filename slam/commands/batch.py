@@ -14,13 +14,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from erfsfm.common.files import is_foreign, read_text
+from erfsfm.common.files import read_text, refuse_foreign
 from erfsfm.common.processes import slam_process
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.frame_range import EVERYTHING
@@ -36,13 +35,11 @@ from slam.runtime.storage.files import from_anywhere, write_atomically
 from slam.sequences.catalogue import sequence_names
 from slam.sequences.recording import frame_range
 
-Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
-
 CSV = "drives.csv"
 _MANIFEST = ".csv"
 _KEYS = ("name", "dataset", "sequence", "camera", "options")
 _LOG_BEGIN = "erfsfm-slam run "  # a log begins with the command
-_FIRST = ("drive", "status", "reason")
+_CSV_BEGIN = "drive,status,reason"
 # columns of drives.csv, and their decimals on a terminal, which shows those that have some
 _COLUMNS: dict[str, tuple[Callable[[Metrics], object], int | None]] = {
     "sequence": (lambda m: m.sequence.name, None),
@@ -89,15 +86,11 @@ class Outcome:
 def options_of_drives(
     weights: str | None, config: str | None, overrides: Sequence[str], frames: str | None, seed: int, device: str
 ) -> list[str]:
-    """Options of ``run`` for all drives, with paths that hold in the folder of each.
-
-    Raises:
-        SlamError, ErfsfmError: one of them is wrong whatever the recordings hold.
-    """
+    """Options of ``run`` for all drives, with paths that hold in the folder of each."""
     load_config(config, overrides)
     record_of_whole_weights(weights or "default")
     frame_range(frames or ":", EVERYTHING)
-    words = []
+    words = ["--seed", str(seed), "--device", device]
     for override in overrides:
         kind, colon, path = override.partition(":")
         is_path = kind.startswith("depth.source=") and bool(colon)
@@ -106,30 +99,20 @@ def options_of_drives(
         words += ["--weights", from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights]
     if config is not None:
         words += ["--config", from_anywhere(config) if Path(config).is_file() else config]
-    if frames is not None:
-        words += ["--frames", frames]
-    return [*words, "--seed", str(seed), "--device", device]
+    return words if frames is None else [*words, "--frames", frames]
 
 
 def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
-    """The drives of a manifest, or the named sequences of a data set.
+    """The drives of a manifest, or the named sequences of a data set, ``all`` of them every one.
 
-    Args:
-        manifest_or_root: a ``.csv`` file, or a data set.
-        sequences: names in the data set; ``all`` is every one.
-        options: of ``run``, for all drives; those of a manifest come after them.
-
-    Raises:
-        SlamError: no such file or sequences, or an entry that is not understood.
+    These ``options`` of ``run`` are for all drives; those of a manifest come after them.
     """
-    is_manifest = manifest_or_root.suffix.lower() == _MANIFEST
-    if is_manifest and manifest_or_root.is_file():
-        if list(sequences) != ["all"]:
-            raise SequenceError(f"{manifest_or_root} names its sequences itself: leave out --sequence")
-        return _manifest(manifest_or_root, options)
-    if is_manifest and not manifest_or_root.exists():
-        raise SequenceError(f"no manifest {manifest_or_root}: check the path")
-    return _of_data_set(manifest_or_root, sequences, options)
+    path = manifest_or_root
+    if path.suffix.lower() != _MANIFEST or path.is_dir():
+        return _of_data_set(path, sequences, options)
+    if list(sequences) != ["all"]:
+        raise SequenceError(f"{path} names its sequences itself: leave out --sequence")
+    return _manifest(path, options)
 
 
 def run_drives(
@@ -141,19 +124,16 @@ def run_drives(
     threads: int | None = None,
     memory_gib: float = 0.0,
 ) -> list[Outcome]:
-    """Run the drives that are not whole in ``output``, and write ``drives.csv``; one outcome a drive, in their order.
+    """Run drives, and write ``drives.csv``; one outcome a drive, in their order.
 
     Args:
-        drives: to run.
+        drives: to run; those that are whole there are kept.
         output: folder of their run folders.
         count: drives at a time on this machine.
         scheduler: address of a Dask scheduler in place of this machine.
-        progress: called with (stage, done, total).
+        progress: is told how many have ended.
         threads: of a drive; None for the cores of this machine by the workers.
         memory_gib: that a drive may use; 0 for all.
-
-    Raises:
-        SlamError: a folder with files of others, or no such scheduler.
     """
     check_output(output, drives)
     output.mkdir(parents=True, exist_ok=True)
@@ -161,36 +141,31 @@ def run_drives(
     work = partial(run_drive, output=output.absolute(), threads=threads, memory_gib=memory_gib)
     outcomes: dict[int, Outcome] = {}
     progress("drives", 0, len(drives))
-    with workers(min(count, len(drives)), scheduler) as spread:
-        for number, result in spread(work, drives):
-            drive = drives[number]
-            if not isinstance(result, Outcome):
-                reason = " ".join(f"{type(result).__name__}: {result}".split())
-                result = Outcome(drive, output / drive.name, "failed", reason)
-            outcomes[number] = result
-            progress("drives", len(outcomes), len(drives))
+    for number, result in spread(work, drives, min(count, len(drives)), scheduler):
+        if not isinstance(result, Outcome):
+            reason = " ".join(f"{type(result).__name__}: {result}".split())
+            result = Outcome(drives[number], output / drives[number].name, "failed", reason)
+        outcomes[number] = result
+        progress("drives", len(outcomes), len(drives))
     ordered = [outcomes[number] for number in range(len(drives))]
     content = csv_of(map(_row, ordered))
     write_atomically(output / CSV, lambda path: path.write_text(content, encoding="utf-8", newline=""), RunError)
     return ordered
 
 
-@contextmanager
-def workers(count: int, scheduler: str | None = None) -> Iterator[Spread]:
-    """A map over items that yields ``(number, result)`` as they end.
+def spread(
+    work: Callable[[Drive], Outcome], drives: Sequence[Drive], count: int = 1, scheduler: str | None = None
+) -> Iterator[tuple[int, Outcome | BaseException]]:
+    """The number and the result of each drive, as they end; the result of work that fails is its exception.
 
-    Items of a worker that dies are given to another; the result of one that fails is its exception, also where several
-    workers died of it.
-
-    Args:
-        count: workers on this machine; 1 without a scheduler works here, and needs no Dask.
-        scheduler: address of a Dask scheduler, whose workers are used instead.
-
-    Raises:
-        SlamError: Dask is not installed, or the scheduler does not answer.
+    One worker works here, without Dask. Drives of a worker that dies are given to another.
     """
     if count == 1 and scheduler is None:
-        yield _one_after_another
+        for number, drive in enumerate(drives):
+            try:
+                yield number, work(drive)
+            except Exception as error:
+                yield number, error
         return
     (distributed,) = import_extra("cluster")
     # memory is that of each drive's process, whose limit is not Dask's
@@ -200,23 +175,11 @@ def workers(count: int, scheduler: str | None = None) -> Iterator[Spread]:
         client = distributed.Client(scheduler, timeout="10s") if scheduler else distributed.Client(**local)
     except (OSError, ValueError) as error:
         raise SlamError(f"no Dask scheduler answers at {scheduler}: {' '.join(str(error).split())}") from error
-
-    def spread(work: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-        futures = client.map(work, items, pure=False)
+    with client:
+        futures = client.map(work, drives, pure=False)
         numbers = {future.key: number for number, future in enumerate(futures)}
         for future in distributed.as_completed(futures):
             yield numbers[future.key], future.exception() or future.result()
-
-    with client:
-        yield spread
-
-
-def _one_after_another(work: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-    for number, item in enumerate(items):
-        try:
-            yield number, work(item)
-        except Exception as error:
-            yield number, error
 
 
 def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 0.0) -> Outcome:
@@ -236,19 +199,14 @@ def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 
 
 
 def check_output(output: Path, drives: Sequence[Drive]) -> None:
-    """Check that a batch of these drives may be written to a folder.
-
-    Raises:
-        RunError: a file, or a folder of other files with the names of a summary or of a log.
-    """
+    """Check that a batch of these drives may be written to a folder."""
     if output.exists() and not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
     if CSV in {drive.name for drive in drives}:
         raise RunError(f"a drive is named {CSV}, as a file of the batch: give it another name in the manifest")
-    logs = {f"{drive.name}.log": _LOG_BEGIN for drive in drives}
-    for name, mark in ({CSV: ",".join(_FIRST)} | logs).items():
-        if is_foreign(output / name, mark):
-            raise RunError(f"{output / name} is none of ours and would be replaced: choose another --output")
+    refuse_foreign([output / CSV], _CSV_BEGIN, RunError)
+    for drive in drives:
+        refuse_foreign([output / f"{drive.name}.log"], _LOG_BEGIN, RunError)
 
 
 def summary_table(outcomes: Sequence[Outcome]) -> Table:
@@ -283,6 +241,8 @@ def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
         rows = [
             {key: word for key, word in row.items() if word} for row in csv.DictReader(lines, skipinitialspace=True)
         ]
+    except FileNotFoundError as error:
+        raise SequenceError(f"no manifest {path}: check the path") from error
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SequenceError(f"the manifest {path} cannot be read: {getattr(error, 'strerror', error)}") from error
     if not rows:

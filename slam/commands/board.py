@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from erfsfm.common.progress import Progress
 from slam.frames import Grey
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import CalibrationError
+from slam.runtime.errors import SlamError
 from slam.sequences.images import ImageSource
 
 Pattern = Literal["chessboard", "charuco"]
@@ -55,20 +55,14 @@ class Board:
         return self.square_m * np.stack([column.ravel(), row.ravel(), np.zeros(row.size)], axis=1)
 
     def charuco(self) -> Any:
-        """OpenCV's ChArUco board.
-
-        Raises:
-            CalibrationError: OpenCV has no such dictionary, or it has too few markers.
-        """
+        """OpenCV's ChArUco board."""
         number = getattr(cv2.aruco, f"DICT_{self.dictionary}", None)
         if number is None or not _DICTIONARY.fullmatch(self.dictionary):
-            raise CalibrationError(f"--dictionary {self.dictionary} is none of OpenCV's: write it as 5X5_100 or 4X4_50")
+            raise SlamError(f"--dictionary {self.dictionary} is none of OpenCV's: write it as 5X5_100 or 4X4_50")
         squares = (self.columns + 1, self.rows + 1)
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         if squares[0] * squares[1] // 2 > len(dictionary.bytesList):
-            raise CalibrationError(
-                f"dictionary {self.dictionary} has too few markers for {squares[0]}x{squares[1]} squares"
-            )
+            raise SlamError(f"dictionary {self.dictionary} has too few markers for {squares[0]}x{squares[1]} squares")
         return cv2.aruco.CharucoBoard(squares, self.square_m, self.marker_share * self.square_m, dictionary)
 
     def describe(self) -> str:
@@ -76,57 +70,43 @@ class Board:
         return f"{self.columns}x{self.rows} {self.pattern}"
 
 
-class Detector:
-    """Finds the corners of a board in grey images."""
+def found_corners(grey: Grey, board: Board, detector: Any) -> tuple[FloatArray, FloatArray] | None:
+    """Corners ``(N, 2)`` in pixels and on the board ``(N, 3)`` in metres; None where the board is not found.
 
-    def __init__(self, board: Board) -> None:
-        """Prepare the search.
+    A chessboard is found only as a whole; of a ChArUco board, by its ``detector``, 12 corners will do, not all in one
+    line.
+    """
+    corners_m = board.corners_m
+    if detector is None:
+        size, normalised = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE
+        is_found, pixels = cv2.findChessboardCornersSB(grey, size, flags=normalised)
+        return (_refined(grey, pixels, _WINDOW), corners_m) if is_found else None
+    pixels, numbers, *_ = detector.detectBoard(grey)
+    if numbers is None or len(numbers) < _LEAST_CHARUCO:
+        return None
+    corners_m = corners_m[np.asarray(numbers).ravel()]
+    if np.linalg.matrix_rank(corners_m - corners_m.mean(axis=0)) < 2:
+        return None
+    beside_marker = (1 - board.marker_share) / 2
+    return _refined(grey, pixels, min(_WINDOW, beside_marker)), corners_m
 
-        Raises:
-            CalibrationError: see `Board.charuco`.
-        """
-        self._board = board
-        beside_marker = (1 - board.marker_share) / 2
-        self._window = _WINDOW if board.pattern == "chessboard" else min(_WINDOW, beside_marker)
-        self._charuco = cv2.aruco.CharucoDetector(board.charuco()) if board.pattern == "charuco" else None
 
-    def find(self, grey: Grey) -> tuple[FloatArray, FloatArray] | None:
-        """Corners ``(N, 2)`` in pixels and on the board ``(N, 3)`` in metres; None where the board is not found.
-
-        A chessboard is found only as a whole; of a ChArUco board 12 corners will do, not all in one line.
-        """
-        if self._charuco is not None:
-            pixels, numbers, *_ = self._charuco.detectBoard(grey)
-            if numbers is None or len(numbers) < _LEAST_CHARUCO:
-                return None
-            corners_m = self._board.corners_m[np.asarray(numbers).ravel()]
-            if np.linalg.matrix_rank(corners_m - corners_m.mean(axis=0)) < 2:
-                return None
-            return self._refined(grey, pixels), corners_m
-        size = (self._board.columns, self._board.rows)
-        is_found, pixels = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-        return (self._refined(grey, pixels), self._board.corners_m) if is_found else None
-
-    def _refined(self, grey: Grey, pixels: Any) -> FloatArray:
-        """Corners ``(N, 2)`` where the gradients around them meet: three times closer than the search finds them."""
-        corners = np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2)
-        nearest = float(pdist(corners[:, 0]).min())
-        half = int(np.clip(self._window * nearest, 2, _MOST_HALF_WINDOW_PX))
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
-        refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
-        return np.asarray(refined, np.float64).reshape(-1, 2)
+def _refined(grey: Grey, pixels: Any, window: float) -> FloatArray:
+    """Corners ``(N, 2)`` where the gradients around them meet: three times closer than the search finds them."""
+    corners = np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2)
+    nearest = float(pdist(corners[:, 0]).min())
+    half = int(np.clip(window * nearest, 2, _MOST_HALF_WINDOW_PX))
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
+    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
+    return np.asarray(refined, np.float64).reshape(-1, 2)
 
 
 def parse_board(text: str) -> tuple[int, int]:
-    """Columns and rows of corners from ``9x6``.
-
-    Raises:
-        CalibrationError: if the text is no such size.
-    """
+    """Columns and rows of corners from ``9x6``."""
     match = _BOARD.fullmatch(text)
     columns, rows = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(columns, rows) < _FEWEST:
-        raise CalibrationError(
+        raise SlamError(
             f"--board {text} is no board: write the corners between its squares, 9x6 for 10 by 7 squares, 3 or more"
         )
     return columns, rows
@@ -152,24 +132,19 @@ class View:
 
 
 def find_views(images: ImageSource, board: Board, progress: Progress) -> list[View]:
-    """All views of a board, of a long video in every n-th image.
-
-    Raises:
-        CalibrationError: too few images show the board.
-        DataError, SequenceError: an image cannot be read.
-    """
-    detector = Detector(board)
+    """All views of a board, of a long video in every n-th image."""
+    detector = cv2.aruco.CharucoDetector(board.charuco()) if board.pattern == "charuco" else None
     step = -(-len(images) // _MOST_SEARCHED)
     frames = range(0, len(images), step)
     views = []
     for count, frame in enumerate(frames, start=1):
         grey = np.asarray(cv2.cvtColor(images.read(frame), cv2.COLOR_RGB2GRAY), np.uint8)
-        found = detector.find(grey)
+        found = found_corners(grey, board, detector)
         if found is not None:
             views.append(_view(frame, grey, *found))
         progress("images", count, len(frames))
     if len(views) < FEWEST_VIEWS:
-        raise CalibrationError(
+        raise SlamError(
             f"{len(views)} of {len(frames)} images show the whole {board.describe()}, {FEWEST_VIEWS} are needed: take "
             "20 or more sharp images with all of the board in them, at many places and tilts; --board counts the "
             "corners between its squares"

@@ -12,15 +12,15 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.files import require_figure, save_figure
+from erfsfm.common.files import refuse_foreign, require_figure, save_figure
 from erfsfm.common.progress import Progress
-from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
+from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import image_folder, list_images
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames
 from slam.commands.board import FEWEST_VIEWS, Board, View, chosen_views, find_views
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import CalibrationError, sequence_errors
+from slam.runtime.errors import SlamError, sequence_errors
 from slam.runtime.storage.files import write_atomically
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.images import ImageFiles, ImageSource
@@ -37,7 +37,6 @@ _MOST_FOCAL_SIGMA = 0.005  # of the focal length
 _LEAST_TILT_DEG = 10.0
 _LEAST_COVERED = 0.3  # of the image
 _WELL_COVERED = 0.6
-_MARK = "erfsfm-slam calibrate"  # of a camera file that was calibrated
 _SIZE_INCHES, _DPI = (13.0, 5.0), 100
 _ARROW_LENGTH = 0.05  # of the image's width, of an error as large as the root mean square
 
@@ -93,34 +92,26 @@ class Calibration:
 def calibrate_camera(
     recording: Path, board: Board, model: Model, output: Path, fps: float | None, progress: Progress
 ) -> list[str]:
-    """Calibrate a camera from a video or a folder of images of a board.
+    """Calibrate a camera from a video or a folder of images of a board; what was found, in lines for the user.
 
-    Args:
-        recording: a video, or a folder of images of one size.
-        board: the board.
-        model: of the lens.
-        output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``, or among
-            other images, where it would be one of them, as ``camera.pdf``.
-        fps: to write; None for the rate of the video, or 10.
-        progress: called with (stage, done, total).
-
-    Returns:
-        What was found, in lines for the user.
+    A picture of the fit is written beside ``output``, ``camera.yaml``: ``camera.png``, or among other images, where it
+    would be one of them, ``camera.pdf``. Without ``fps`` the rate of the video is written, or 10.
 
     Raises:
-        CalibrationError: the images do not give a camera; nothing is written.
+        SlamError: the images do not give a camera; nothing is written.
         SequenceError: the images cannot be read.
     """
     if output.suffix not in (".yaml", ".yml"):
-        raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
+        raise SlamError(f"--output {output} must end in .yaml: it is the camera file that run reads")
     among_images = any(path.stem != output.stem for path in list_images(output.parent))
     picture = output.with_suffix(".pdf" if among_images else ".png")
-    _refuse_other_kind(output, picture)
+    refuse_foreign([output], "fx:", SlamError)  # any camera file may be calibrated again
     require_figure(picture)
     images, own_fps = _open(recording)
     views = chosen_views(find_views(images, board, progress))
     fit = fit_camera(views, images.width, images.height, model)
-    source = f"{_MARK}: {len(fit.views)} views of a {board.describe()}, reprojection error {fit.error_px:.3f} pixels"
+    source = f"erfsfm-slam calibrate: {len(fit.views)} views of a {board.describe()}, "
+    source += f"reprojection error {fit.error_px:.3f} pixels"
     fx, fy, cx, cy = map(_rounded, fit.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     camera = CameraFile(
         width=fit.width,
@@ -137,7 +128,7 @@ def calibrate_camera(
     )
     Undistortion(camera)  # refuses a lens that cannot be undistorted
     text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
-    write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"), CalibrationError)
+    write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"))
     _write_picture(picture, fit, camera, images)
     lines = [
         f"fx {camera.fx:g}, fy {camera.fy:g} ± {100 * fit.focal_sigma:.2f} %, cx {camera.cx:g}, cy {camera.cy:g}, "
@@ -153,22 +144,32 @@ def calibrate_camera(
 
 
 def fit_camera(views: list[View], width: int, height: int, model: Model) -> Calibration:
-    """Fit a camera to views of a board; views that fit three times worse than the median are left out.
-
-    Raises:
-        CalibrationError: the views do not determine the camera, or no camera explains them.
-    """
-    found = _fit(views, width, height, model)
-    good = found.errors_px <= _OUTLIER * np.median(found.errors_px)
+    """Fit a camera to views of a board; views that fit three times worse than the median are left out."""
+    fit = _fit(views, width, height, model)
+    good = fit.errors_px <= _OUTLIER * np.median(fit.errors_px)
     if not good.all():
-        found = _fit([view for view, is_good in zip(views, good, strict=True) if is_good], width, height, model)
-    _require_determined(found)
-    return found
+        fit = _fit([view for view, is_good in zip(views, good, strict=True) if is_good], width, height, model)
+    advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
+    steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
+    faults = {
+        f"all {len(fit.views)} views are frontal (tilts under {steepest:.0f} degrees): they do not determine the focal "
+        f"length; {advice}": steepest < _LEAST_TILT_DEG,
+        f"the reprojection error is {fit.error_px:.2f} pixels, {most_error:.1f} at most: is the board flat, --board "
+        f"right, and --model {fit.model} that of the lens?": fit.error_px > most_error,
+        f"the views leave the focal length uncertain by {100 * fit.focal_sigma:.1f} %, at most "
+        f"{100 * _MOST_FOCAL_SIGMA:.1f} %: {advice}": not fit.focal_sigma <= _MOST_FOCAL_SIGMA,
+        f"the board was seen in {100 * fit.covered:.0f} % of the image alone, {100 * _LEAST_COVERED:.0f} % at least: "
+        f"the lens is not determined elsewhere; {advice}": fit.covered < _LEAST_COVERED,
+    }
+    for words, is_fault in faults.items():
+        if is_fault:
+            raise SlamError(words)
+    return fit
 
 
 def _fit(views: list[View], width: int, height: int, model: Model) -> Calibration:
     if len(views) < FEWEST_VIEWS:
-        raise CalibrationError(f"{len(views)} sharp views fit one camera, {FEWEST_VIEWS} are needed: take more images")
+        raise SlamError(f"{len(views)} sharp views fit one camera, {FEWEST_VIEWS} are needed: take more images")
     try:
         if model == "fisheye":
             return _fit_lens(views, width, height, model, _FISHEYE_FLAGS)
@@ -176,7 +177,7 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
         bent = _fit_lens(views, width, height, model, 0)
     except cv2.error as error:
         reason = " ".join(str(error.err or error).split())
-        raise CalibrationError(
+        raise SlamError(
             f"OpenCV finds no {model} camera for these views ({reason}): show the board at more places and tilts"
         ) from error
     return bent if bent.error_px < _GAIN * plain.error_px else plain
@@ -212,29 +213,6 @@ def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: i
     return Calibration(model, width, height, np.asarray(K), distortion, views, residuals, T_camera_board, sigma)
 
 
-def _require_determined(fit: Calibration) -> None:
-    """Refuse a camera that the views do not determine.
-
-    Raises:
-        CalibrationError: with what to do.
-    """
-    advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
-    steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
-    faults = {
-        f"all {len(fit.views)} views are frontal (tilts under {steepest:.0f} degrees): they do not determine the focal "
-        f"length; {advice}": steepest < _LEAST_TILT_DEG,
-        f"the reprojection error is {fit.error_px:.2f} pixels, {most_error:.1f} at most: is the board flat, --board "
-        f"right, and --model {fit.model} that of the lens?": fit.error_px > most_error,
-        f"the views leave the focal length uncertain by {100 * fit.focal_sigma:.1f} %, at most "
-        f"{100 * _MOST_FOCAL_SIGMA:.1f} %: {advice}": not fit.focal_sigma <= _MOST_FOCAL_SIGMA,
-        f"the board was seen in {100 * fit.covered:.0f} % of the image alone, {100 * _LEAST_COVERED:.0f} % at least: "
-        f"the lens is not determined elsewhere; {advice}": fit.covered < _LEAST_COVERED,
-    }
-    for words, is_fault in faults.items():
-        if is_fault:
-            raise CalibrationError(words)
-
-
 def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: ImageSource) -> None:
     """Draw a fit: the sharpest image with all corners and the residuals of its own, and the image undistorted."""
     from matplotlib.figure import Figure
@@ -257,20 +235,6 @@ def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: Ima
     for axis in (before, after):
         axis.set_axis_off()
     save_figure(figure, path, _DPI)
-
-
-def _refuse_other_kind(output: Path, picture: Path) -> None:
-    """A picture is replaced beside a camera file that was calibrated."""
-    if output.is_dir():
-        raise CalibrationError(f"--output {output} is a folder: give the name of a file to write")
-    source = None
-    if output.is_file() and output.stat().st_size:
-        try:
-            source = read_camera_file(output).source
-        except DataError as error:
-            raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
-    if picture.exists() and not (source or "").startswith(_MARK):
-        raise CalibrationError(f"{picture} exists and is of no earlier calibration: choose another --output")
 
 
 def _open(recording: Path) -> tuple[ImageSource, float | None]:

@@ -13,7 +13,7 @@ import typer
 
 from erfsfm.common import command_line
 from erfsfm.common.progress import progress_bar
-from slam.runtime.errors import DownloadError, RunError, SlamError
+from slam.runtime.errors import RunError, SlamError
 
 if TYPE_CHECKING:
     from slam.results.folder import RunFolder
@@ -64,8 +64,7 @@ def run(
 
     Example: erfsfm-slam run --dataset KITTI --sequence 09
     """
-    from slam.commands.run.request import RunRequest
-    from slam.commands.run.run import perform
+    from slam.commands.run import RunRequest, perform
 
     with progress_bar() as progress:
         folder = perform(RunRequest.of(**_given(context), progress=progress))
@@ -96,7 +95,7 @@ def live(
 
     Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
-    from slam.commands.live.run import LiveRequest, run_live
+    from slam.commands.live import LiveRequest, run_live
 
     folder = run_live(LiveRequest.of(**_given(context)), lambda message: typer.echo(json.dumps(message)))
     typer.echo(f"everything in {folder.path}", err=True)
@@ -364,9 +363,9 @@ def download(
     typer.echo(LICENCE)
     if not accept_licence:
         if not sys.stdin.isatty():
-            raise DownloadError("the licence above is to be accepted: give --accept-licence")
+            raise SlamError("the licence above is to be accepted: give --accept-licence")
         if not typer.confirm("Do you accept it?"):
-            raise DownloadError("the licence was not accepted: nothing is downloaded")
+            raise SlamError("the licence was not accepted: nothing is downloaded")
     with progress_bar() as progress:
         count = download_kitti(sequence, to, mirror or SERVER, camera == "grey", lidar, progress)
     typer.echo(f"{count} files in {to}: erfsfm-slam run --dataset {to} --sequence {sequence}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import os
 import platform
+from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -30,70 +32,53 @@ NO_DATA_SET = (
 
 
 def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
-    """Check the installation; one line for each finding, each starting with ``ok`` or ``missing``.
-
-    Args:
-        dataset: a data set to check; None for ``$KITTI_ODOMETRY``, if it is set.
-        camera: a ``camera.yaml`` in place of its own, or ``fov=DEGREES``.
-    """
+    """Check the installation and a data set, else ``$KITTI_ODOMETRY``; lines begin with ``ok`` or ``missing``."""
     lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
-    lines += [_package(name) for name in (*LOOKED_UP, *IMPORTED)]
-    lines.append(_open3d())
-    lines += [_weights(name) for name in WEIGHTS]
+    reinstall = "; run make setup, or pip install --force-reinstall {}"
+    lines += [_checked(name, partial(_package, name), reinstall.format(name)) for name in (*LOOKED_UP, *IMPORTED)]
+    lines.append(_checked("open3d", lambda: f" {import_open3d().__version__}"))
+    lines += [_checked(f"weights {name}", partial(_weights, name)) for name in WEIGHTS]
     variable = os.environ.get(KITTI_VARIABLE)
     root = dataset or (Path(variable) if variable else None)
-    if root is not None:
-        return lines + _dataset(root, camera)
-    if camera is not None:
-        lines.append(f"missing  the data set of camera {camera}: give --dataset")
-    return [*lines, NO_DATA_SET]
-
-
-def _package(name: str) -> str:
-    try:
-        if name in IMPORTED:
-            importlib.import_module(IMPORTED[name])
-        return f"ok       {name} {version(name)}"
-    except (ImportError, OSError) as error:
-        return f"missing  {name}: {error}; run make setup, or pip install --force-reinstall {name}"
-
-
-def _open3d() -> str:
-    try:
-        return f"ok       open3d {import_open3d().__version__}"
-    except SlamError as error:
-        return f"missing  {error}"
-
-
-def _weights(name: str) -> str:
-    try:
-        record = record_of_whole_weights(name)
-        return f"ok       weights {name}: {record.network.depth} and {record.network.pose}, {record.licence}"
-    except ErfsfmError as error:
-        return f"missing  weights {name}: {error}"
-
-
-def _dataset(root: Path, camera: Path | None) -> list[str]:
+    if root is None:
+        no_camera = [] if camera is None else [f"missing  the data set of camera {camera}: give --dataset"]
+        return [*lines, *no_camera, NO_DATA_SET]
     try:
         kinds = sequence_kinds(root)
     except SlamError as error:
-        return [f"missing  {error}"]
+        return [*lines, f"missing  {error}"]
     if not kinds:
-        return [f"missing  {root} is not a data set of a kind that docs/recordings.md lists"]
-    return [_sequence(root, name, kind, camera) for name, kind in kinds.items()]
+        lines.append(f"missing  {root} is not a data set of a kind that docs/recordings.md lists")
+    for name, kind in kinds.items():
+        lines.append(_checked(f"sequence {name}", partial(_sequence, root, name, kind, camera), f" ({kind})"))
+    return lines
+
+
+def _checked(part: str, describe: Callable[[], str], advice: str = "") -> str:
+    """A part with its description; or why it is missing, with an ``advice``."""
+    try:
+        return f"ok       {part}{describe()}"
+    except (ImportError, OSError, ErfsfmError, SlamError) as error:
+        return f"missing  {part}: {error}{advice}"
+
+
+def _package(name: str) -> str:
+    if name in IMPORTED:
+        importlib.import_module(IMPORTED[name])
+    return f" {version(name)}"
+
+
+def _weights(name: str) -> str:
+    record = record_of_whole_weights(name)
+    return f": {record.network.depth} and {record.network.pose}, {record.licence}"
 
 
 def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:
-    try:
-        sequence = open_sequence(root, name, camera)
-    except SlamError as error:
-        return f"missing  sequence {name}: {error} ({kind})"
+    sequence = open_sequence(root, name, camera)
     truth, beside = "true poses", poses_beside(root)
     if sequence.reference is None:
         truth = "no true poses" + ("" if beside is None else f" (--truth {beside} gives some)")
     height = f"camera {sequence.camera_height_m:.2f} m high" if sequence.camera_height_m else "camera height unknown"
     scans = sum(sequence.has_scan(k) for k in range(len(sequence)))
     size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
-    return (
-        f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans ({kind})"
-    )
+    return f": {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans ({kind})"

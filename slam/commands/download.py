@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from erfsfm.common.progress import Progress
-from slam.runtime.errors import DownloadError
+from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import write_atomically
 
@@ -43,18 +43,11 @@ def download_kitti(
         sequence: ``00`` to ``21``; poses are public of the first eleven.
         folder: gets ``dataset/sequences/NN`` and ``dataset/poses/NN.txt``.
         server: address of the folder of the archives.
-        is_grey: the grey camera instead of the colour camera.
-        with_scans: LiDAR as well.
-        progress: called with (stage, done, total).
-
-    Returns:
-        The number of files.
-
-    Raises:
-        DownloadError: one line; files that are whole stay.
+        is_grey, with_scans: the grey camera instead of the colour camera; LiDAR as well.
+        progress: is told how many of the files, whose number is returned, are there.
     """
     if not _NAME.fullmatch(sequence) or int(sequence) >= _SEQUENCES:
-        raise DownloadError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")
+        raise SlamError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")
     archive, camera = _GREY if is_grey else _COLOUR
     home = f"dataset/sequences/{sequence}"
     wanted: list[tuple[str, tuple[str, ...]]] = [(_CALIBRATION, (f"{home}/calib.txt", f"{home}/times.txt"))]
@@ -71,9 +64,7 @@ def download_kitti(
     missing = sum(member.file_size for _, member in parts if not (folder / member.filename).is_file())
     free = shutil.disk_usage(folder).free
     if missing > free:
-        raise DownloadError(
-            f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to"
-        )
+        raise SlamError(f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to")
     for done, (source, member) in enumerate(parts, 1):
         source.fetch(member, folder)
         progress("files", done, len(parts))
@@ -88,30 +79,23 @@ class _RemoteZip:
         self._archive = self._open()
 
     def matching(self, *prefixes: str) -> list[zipfile.ZipInfo]:
-        """Files whose names begin with one of the prefixes, in the order in which they are stored.
-
-        Raises:
-            DownloadError: there are none, or a name leads out of the folder.
-        """
+        """Files whose names begin with one of the prefixes, in the order in which they are stored."""
         members = [m for m in self._archive.infolist() if m.filename.startswith(prefixes) and not m.is_dir()]
         if not members:
-            raise DownloadError(f"{self.url} has no {' or '.join(prefixes)}: check the name of the sequence")
+            raise SlamError(f"{self.url} has no {' or '.join(prefixes)}: check the name of the sequence")
         for member in members:
             path = PurePosixPath(member.filename)
             if path.is_absolute() or ".." in path.parts or "\\" in member.filename:
-                raise DownloadError(f"{self.url} has a member {member.filename!r} outside of its folder: not unpacked")
+                raise SlamError(f"{self.url} has a member {member.filename!r} outside of its folder: not unpacked")
         return sorted(members, key=lambda member: member.header_offset)
 
     def fetch(self, member: zipfile.ZipInfo, folder: Path) -> None:
-        """Write one member under a folder; one that is there with the same size and CRC stays.
-
-        Raises:
-            DownloadError: the connection broke, the CRC is wrong, or the file cannot be written.
-        """
+        """Write one member under a folder; one that is there with the same size and CRC stays."""
         path = folder / member.filename
-        if not _is_whole(path, member):
+        is_there = path.is_file() and path.stat().st_size == member.file_size
+        if not is_there or zlib.crc32(path.read_bytes()) != member.CRC:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, lambda part: self._copy(member, part), DownloadError, sync=False)
+            write_atomically(path, lambda part: self._copy(member, part), sync=False)
 
     def _copy(self, member: zipfile.ZipInfo, path: Path) -> None:
         broken = self._errors(f"{member.filename} broke off")
@@ -128,11 +112,11 @@ class _RemoteZip:
             try:
                 return remotezip.RemoteZip(self.url, session=session, **options)
             except remotezip.RangeNotSupported as error:
-                raise DownloadError(
+                raise SlamError(
                     f"{self.url}: the server gives no parts of files (HTTP ranges): fetch the whole file there"
                 ) from error
             except (zipfile.BadZipFile, ValueError) as error:
-                raise DownloadError(f"{self.url} is no zip archive ({error}): check the address") from error
+                raise SlamError(f"{self.url} is no zip archive ({error}): check the address") from error
 
     @contextmanager
     def _errors(self, what: str) -> Iterator[None]:
@@ -143,18 +127,8 @@ class _RemoteZip:
             yield
         except broken as error:
             if isinstance(error.__context__, ValueError):  # what requests says of an address without server
-                raise DownloadError(f"{self.url} is no address: give --mirror as https://HOST/FOLDER") from error
-            raise DownloadError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
-
-
-def _is_whole(path: Path, member: zipfile.ZipInfo) -> bool:
-    if not path.is_file() or path.stat().st_size != member.file_size:
-        return False
-    crc = 0
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            crc = zlib.crc32(chunk, crc)
-    return crc == member.CRC
+                raise SlamError(f"{self.url} is no address: give --mirror as https://HOST/FOLDER") from error
+            raise SlamError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
 
 
 def _cause(error: BaseException) -> str:

@@ -45,13 +45,9 @@ def against_reference(
     as_json: bool,
     csv: Path | None,
 ) -> None:
-    """Any number of trajectories against one truth, as a table of systems.
-
-    Raises:
-        SlamError: a file cannot be read or written, or an error is over its limit.
-    """
+    """Any number of trajectories against one truth, as a table of systems; `SlamError` where one is over its limit."""
     if csv is not None:
-        check_replaced(csv, {".csv": b"system,path"})
+        check_replaced(csv, b"system,path")
     runs = compare(named_paths(paths), reference, format, frames)
     if csv is not None:
         content = csv_of(dict(_flat(run.tree())) for run in runs)
@@ -62,15 +58,12 @@ def against_reference(
         notes = [UNITS, *missing_notes({run.system: run.errors for run in runs})]
         head = ["system", "poses", *(column.name for column in COLUMNS)]
         Table(head, list(_rows(runs)), f"Errors against {reference}", notes).print()
-    _require([f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)])
+    if broken := [f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)]:
+        raise SlamError("; ".join(broken))
 
 
 def of_runs(paths: Sequence[Path], as_json: bool) -> None:
-    """Run folders side by side.
-
-    Raises:
-        SlamError: one is none.
-    """
+    """Run folders side by side."""
     runs = [RunFolder.open(path) for path in paths]
     if as_json:
         typer.echo(json.dumps(runs_json(runs), indent=2))
@@ -79,11 +72,7 @@ def of_runs(paths: Sequence[Path], as_json: bool) -> None:
 
 
 def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool) -> None:
-    """One trajectory against another under every alignment, with the commands of evo that give the same.
-
-    Raises:
-        SlamError: a file cannot be read, or an error is over its limit.
-    """
+    """One trajectory against another under every alignment, with the commands of evo that give the same."""
     (run,) = compare([("", estimate)], reference, format)
     if as_json:
         typer.echo(run.errors.to_json())
@@ -94,11 +83,7 @@ def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], 
         kind = "tum" if timed else "kitti"
         files = [path / trajectory_file(name, kind) if path.is_dir() else path for path, name in both.items()]
         typer.echo("\n".join(evo_commands(files[0], files[-1], format)))
-    _require(exceeded(run.errors, limits))
-
-
-def _require(broken: Sequence[str]) -> None:
-    if broken:
+    if broken := exceeded(run.errors, limits):
         raise SlamError("; ".join(broken))
 
 
@@ -122,9 +107,6 @@ def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
     Args:
         words: each a path, whose system has the name of the file or folder, or ``NAME=PATH``, where PATH may be a
             pattern (``orb=runs/orb_*.txt``); all paths of one NAME are of one system.
-
-    Raises:
-        RunError: a pattern that no file fits.
     """
     found: list[tuple[str, Path]] = []
     for word in words:
@@ -142,11 +124,7 @@ def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
 
 
 def trajectory_at(path: Path, format: str = "auto", of_run: str = "optimised") -> Trajectory:
-    """A trajectory file, or one of the trajectories of a run folder.
-
-    Raises:
-        SlamError: it cannot be read, or the run has none.
-    """
+    """A trajectory file, or one of the trajectories of a run folder."""
     if not path.is_dir():
         return read_trajectory(path, format)
     trajectory = RunFolder.open(path).trajectory(of_run)
@@ -165,9 +143,6 @@ def compare(
         reference: a trajectory file, or a run folder with a reference.
         format: of the files.
         frames: ``A:B`` of the reference, half-open; a file of B - A rows without frame numbers is of these frames.
-
-    Raises:
-        SlamError: a file cannot be read, or its poses do not belong to those of the reference.
     """
     truth = trajectory_at(reference, format, REFERENCE)
     chosen = None if frames is None else frame_range(frames, len(truth))

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from erfsfm.common.errors import ErfsfmError
-from erfsfm.common.files import is_foreign
+from erfsfm.common.files import refuse_foreign
 from erfsfm.common.progress import Progress, silent
 from slam.commands.occupancy import occupancy_grid, write_ros_map
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
-from slam.formats.trajectory import Trajectory, nearest_stamps
+from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
 from slam.frames import Intrinsics, Sequence
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -46,9 +46,10 @@ POINTS, TRANSFORMS = "points.ply", "transforms.json"
 _IMAGES = "images"
 _MADE_BY = {"made_by": "erfsfm-slam"}
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
-_SCENES = {  # noun, files, and what one of them holds if it is ours
-    "colmap": ("a COLMAP model", (_IMAGES, BINARY_FOLDER, *MODEL_FILES), MODEL_FILES[0], HEADER),
-    "nerfstudio": ("a scene", (_IMAGES, POINTS, TRANSFORMS), TRANSFORMS, json.dumps(_MADE_BY)[1:-1]),
+_SUFFIXES = {"mesh": (".ply",), "cloud": (".ply",), "occupancy": (".yaml", ".pgm"), "colmap": (), "nerfstudio": ()}
+_SCENES = {  # files, and what one of them holds if it is ours
+    "colmap": ((_IMAGES, BINARY_FOLDER, *MODEL_FILES), HEADER),
+    "nerfstudio": ((_IMAGES, POINTS, TRANSFORMS), json.dumps(_MADE_BY)[1:-1]),
 }
 _T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_PIXEL = 0.5  # (0.5, 0.5) is the centre of their top-left pixel
@@ -79,13 +80,11 @@ def export(
         output: the file; for ``colmap`` and ``nerfstudio`` the folder.
         up: ``y-down`` as the run has it; ``z``: x right, y ahead, z up. Cameras keep their own axes, only the world is
             rotated.
-        resolution: side of a cell of an occupancy grid.
-        dataset: where the images of the run are now, for ``colmap`` and ``nerfstudio``; None where the run found them.
-        points: at most so many of a COLMAP model.
-        progress: called with (stage, done, total).
+        resolution, dataset, points: as ``erfsfm-slam export --help`` explains them.
+        progress: is told how many images are written.
 
     Returns:
-        What was written.
+        What was written: of an occupancy grid the ``.yaml``.
 
     Raises:
         SlamError: an option without effect, a part that the run lacks or that is damaged, missing or other images, or a
@@ -120,30 +119,18 @@ def export(
 
 def _check_target(what: str, output: Path) -> None:
     """Refuse, before anything is computed, what would replace a file of another kind."""
-    if what in _SCENES:
-        noun, names, marked, mark = _SCENES[what]
-        if output.exists() and not output.is_dir():
-            raise RunError(f"{output} is a file: {noun} is several files, give the name of a folder")
-        others = [name for name in names if (output / name).exists()]
-        if others and not _is_own(output / marked, mark):
-            raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
-        return
-    beginnings = {".yaml": b"", ".pgm": b"P5"} if what == "occupancy" else {".ply": b"ply"}
-    if output.suffix.lower() not in beginnings:
-        named = " or ".join(beginnings)
-        raise RunError(f"{what} is written as {named}; got '{output.name}', give a name that ends so")
-    files = [output]
-    if what == "occupancy":
-        files = [output.with_suffix(suffix) for suffix in beginnings]
-        present = [path for path in files if path.is_file() and path.stat().st_size]
-        if present and not _is_own(files[0], "occupied_thresh:"):
-            raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
-    for path in files:
-        check_replaced(path, beginnings)
-
-
-def _is_own(path: Path, mark: str) -> bool:
-    return path.is_file() and not is_foreign(path, mark)
+    suffixes = _SUFFIXES[what]
+    if not suffixes and output.exists() and not output.is_dir():
+        raise RunError(f"{output} is a file: {what} is several files, give the name of a folder")
+    if suffixes and output.suffix.lower() not in suffixes:
+        raise RunError(f"{what} is written as {' or '.join(suffixes)}; got '{output.name}', give a name that ends so")
+    if what in _MAPS:
+        check_replaced(output, b"ply")
+    elif what == "occupancy":
+        refuse_foreign([output.with_suffix(suffix) for suffix in suffixes], "occupied_thresh:", RunError)
+    else:
+        names, mark = _SCENES[what]
+        refuse_foreign([output / name for name in names], mark, RunError)
 
 
 def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Path:
@@ -151,9 +138,9 @@ def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Pat
     if unit not in (METRES, CAMERA_HEIGHTS):
         raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
     mesh, trajectory = _map(folder, "mesh", "z"), _trajectory(folder, "z")
-    cells, grid = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
+    cells, corner = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
     written = output.with_suffix(".yaml")
-    write_ros_map(written, cells, (grid.x_min, grid.y_min), resolution, unit)
+    write_ros_map(written, cells, corner, resolution, unit)
     return written
 
 
@@ -167,10 +154,7 @@ def _map(folder: RunFolder, what: str, up: str) -> Ply:
 
 def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     """The optimised trajectory in the given axes."""
-    folder.require(ESTIMATE)
-    trajectory = folder.trajectory("optimised")
-    if trajectory is None:
-        raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
+    trajectory = read_trajectory(folder.require(ESTIMATE), "tum")
     frames = folder.metrics().sequence.frames
     if frames is not None and frames != len(trajectory):
         raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
@@ -180,9 +164,25 @@ def _trajectory(folder: RunFolder, up: str) -> Trajectory:
 def _model_points(
     places: Places, R_up_world: FloatArray, cloud: Ply | None, at_most: int | None
 ) -> tuple[FloatArray, NDArray[np.uint8], Sightings]:
-    """Points ``(P, 3)`` of a model and their colours: corners tracked through the images, then the cloud of the map."""
-    points, sightings = _tracked(places, at_most)
-    points = points @ R_up_world.T
+    """Points ``(P, 3)`` of a model and their colours: corners tracked through the images, then the cloud of the map.
+
+    Of more than ``at_most`` those with the longest tracks are taken.
+    """
+    points, sightings = np.zeros((0, 3)), Sightings.none()
+    if places.views:
+        structure = PlaceStructure(places, OF_KEYFRAMES)
+        tracks = structure.tracks()
+        length = np.bincount(tracks.point, minlength=len(tracks.points))
+        is_known = np.isfinite(tracks.points).all(axis=1)
+        chosen = np.argsort(np.where(is_known, -length, 1), kind="stable")[: int(is_known.sum())][:at_most]
+        number = np.full(len(tracks.points), -1)
+        number[chosen] = np.arange(len(chosen))
+        kept = number[tracks.point] >= 0
+        views, corners = tracks.views[kept], tracks.corners[kept]
+        frames = np.array([view.index for view in places.views], np.intp)[views]
+        pixels, errors_px = structure.pixels(views, corners), tracks.errors_px[kept]
+        points = tracks.points[chosen] @ R_up_world.T
+        sightings = Sightings(frames, pixels, number[tracks.point[kept]], errors_px)
     colours = np.full((len(points), 3), _GREY, np.uint8)
     if cloud is not None:
         if len(points):
@@ -219,24 +219,6 @@ def _write_scene(
     scene["frames"] = [{"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()]
     text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
     write_atomically(output / TRANSFORMS, lambda file: file.write_text(text, encoding="utf-8"), RunError)
-
-
-def _tracked(places: Places, at_most: int | None) -> tuple[FloatArray, Sightings]:
-    """Points of corners ``(P, 3)`` in the axes of the run, at most as many as wanted, the longest tracks first."""
-    if not places.views:
-        return np.zeros((0, 3)), Sightings.none()
-    structure = PlaceStructure(places, OF_KEYFRAMES)
-    tracks = structure.tracks()
-    length = np.bincount(tracks.point, minlength=len(tracks.points))
-    wanted = np.isfinite(tracks.points).all(axis=1)
-    chosen = np.argsort(np.where(wanted, -length, 1), kind="stable")[: int(wanted.sum())][:at_most]
-    number = np.full(len(tracks.points), -1)
-    number[chosen] = np.arange(len(chosen))
-    kept = number[tracks.point] >= 0
-    views, corners = tracks.views[kept], tracks.corners[kept]
-    pixels = structure.pixels(views, corners)
-    frames = np.array([view.index for view in places.views], np.intp)[views]
-    return tracks.points[chosen], Sightings(frames, pixels, number[tracks.point[kept]], tracks.errors_px[kept])
 
 
 def _write_images(

@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress, silent
-from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.camera_file import CAMERA_FILE
 from erfsfm.common.readers.images import image_folder, list_images, read_image
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
@@ -54,7 +54,7 @@ class Localisation:
     ``number`` is that of the image among those of its folder.
     """
 
-    image: str
+    image: str = ""
     T_world_camera: FloatArray | None = None
     nearest_frame: int | None = None
     inliers: int = 0
@@ -64,12 +64,12 @@ class Localisation:
     def tree(self) -> dict[str, Any]:
         """For JSON: unknown values are null, with the reason."""
         T_world_camera = self.T_world_camera
-        entry = {"image": self.image, "found": T_world_camera is not None}
+        entry: dict[str, Any] = {"image": self.image, "found": T_world_camera is not None}
         if T_world_camera is None:
-            values: dict[str, Any] = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
+            values = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
             return entry | values | {"reason": self.reason}
-        pose = {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
-        return entry | pose | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
+        entry |= {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
+        return entry | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
 
 
 def localise(
@@ -88,7 +88,7 @@ def localise(
         camera: their ``camera.yaml``; None for the one beside them or their folder, or else the camera of the run.
         frames: ``A:B``, half-open, of the images in their order; None for all.
         every: of these, every n-th.
-        progress: called with (stage, done, total).
+        progress: is told how many images are done.
 
     Raises:
         SlamError, DataError: no images or none that can be read, no places in the run, a camera file that does not fit,
@@ -99,7 +99,11 @@ def localise(
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
-    own_camera = _camera_file(camera, images, paths)
+    if camera is None:
+        folder = images if images.is_dir() else images.parent
+        own_camera = beside(paths[0].parent, folder, folder.absolute().parent)  # where ``run`` looks
+    else:
+        own_camera = explicit_camera(camera, ImageFiles(in_order(paths)))
     if own_camera is None and places.intrinsics.undistorted:
         raise SequenceError(
             f"{run.path} undistorted its images, and {images} has no {CAMERA_FILE}: give its --camera, which is fov=70 "
@@ -141,9 +145,6 @@ def write_localisations(path: Path, found: Sequence[Localisation]) -> None:
     """Write the poses found: as TUM, or after the number of their frame as KITTI where the name ends in ``.kitti``.
 
     The stamp, or number, is that of the image.
-
-    Raises:
-        RunError: no image was found.
     """
     poses = {each.number: each.T_world_camera for each in found if each.T_world_camera is not None}
     if not poses:
@@ -156,12 +157,7 @@ class Localiser:
     """Localises single images among the places of one run; no network is used."""
 
     def __init__(self, places: Places, intrinsics: Intrinsics | None = None) -> None:
-        """Index the places.
-
-        Args:
-            places: of an old run, at least one view.
-            intrinsics: of the new images; None for those of the run, with images resized to it.
-        """
+        """``intrinsics`` are of the new images; without any they are resized to those of the run."""
         self._places = places
         self._thresholds = replace(OF_FRAMES, max_hamming=OF_KEYFRAMES.max_hamming)
         self._resizes = intrinsics is None
@@ -174,22 +170,19 @@ class Localiser:
         """Localise an image ``(H, W, 3)`` uint8 RGB: at similar places, then in the map around.
 
         Points of learned depth are used beside triangulated ones where both agree, else only if these are too few.
-
-        Raises:
-            SequenceError: the image has another shape than its camera.
         """
         view = self._view(image)
         rows = self._index.nearest(view, _PLACES_TRIED)
         if not rows:
             return Localisation(name, reason="no place of the map is similar")
         learned = self._structure.confirms_depth(rows)
-        found = self._found(name, rows, view, learned)
+        found = self._found(rows, view, learned)
         if found.T_world_camera is None:
-            found = self._found(name, rows, view, not learned)
+            found = self._found(rows, view, not learned)
         if found.T_world_camera is None:
-            return replace(found, reason=f"{len(rows)} similar places; {found.reason}")
+            return Localisation(name, reason=f"{len(rows)} similar places; {found.reason}")
         away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
-        return replace(found, nearest_frame=self._places.views[int(away.argmin())].index)
+        return replace(found, image=name, nearest_frame=self._places.views[int(away.argmin())].index)
 
     def _view(self, image: Image) -> View:
         camera = self._intrinsics
@@ -204,41 +197,32 @@ class Localiser:
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
-    def _found(self, name: str, rows: list[int], view: View, learned: bool) -> Localisation:
+    def _found(self, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
         starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
         starts.sort(key=lambda start: len(start[1]), reverse=True)
-        found = [self._refined(name, start, rows, view, learned) for start in starts[:_STARTS]]
-        nowhere = Localisation(name, reason="no place has corners that fit one pose")
+        found = [self._refined(T_camera_world, rows, view, learned) for T_camera_world, _ in starts[:_STARTS]]
+        nowhere = Localisation(reason="no place has corners that fit one pose")
         return max(found, key=lambda each: each.inliers, default=nowhere)
 
-    def _refined(
-        self,
-        name: str,
-        start: tuple[FloatArray, NDArray[np.intp]],
-        rows: list[int],
-        view: View,
-        learned: bool,
-    ) -> Localisation:
+    def _refined(self, T_camera_world: FloatArray, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose by all corners of the map around a first one; or why it is none."""
-        T_camera_world, _ = start
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
             points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
             if len(points) < self._thresholds.min_inliers:
-                return Localisation(name, reason=f"only {len(points)} corners agree")
+                return Localisation(reason=f"only {len(points)} corners agree")
             pose = resect([T_camera_world], points, pixels, self._intrinsics.K)
             T_camera_world = pose.T_camera_world
         inliers = pose.residual_px < self._thresholds.reprojection_px
         count = int(inliers.sum())
         if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
-            return Localisation(name, reason=f"only {count} of {len(inliers)} corners agree")
+            return Localisation(reason=f"only {count} of {len(inliers)} corners agree")
         depth = float(np.median(apply(T_camera_world, points[inliers])[:, 2]))
         sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
         if sigma > _MOST_SIGMA:
-            reason = f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
-            return Localisation(name, reason=reason)
-        return Localisation(name, invert(T_camera_world), inliers=count)
+            return Localisation(reason=f"{count} corners agree, but give the position to {sigma:.1%} of their depth")
+        return Localisation(T_world_camera=invert(T_camera_world), inliers=count)
 
     def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]] | None:
         """The pose by one place, as `consensus` gives it."""
@@ -272,11 +256,7 @@ class Localiser:
 
 
 def _image_paths(images: Path) -> list[Path]:
-    """One image, or the images of a folder in their order.
-
-    Raises:
-        SequenceError: there are none.
-    """
+    """One image, or the images of a folder in their order."""
     if images.is_file():
         return [images]
     folder = image_folder(images) if images.is_dir() else None
@@ -284,11 +264,3 @@ def _image_paths(images: Path) -> list[Path]:
         what = "no images in it" if images.is_dir() else "no such file or folder"
         raise SequenceError(f"{images}: {what}; give an image or a folder of png, jpg or bmp images")
     return list_images(folder)
-
-
-def _camera_file(explicit: Path | None, images: Path, paths: list[Path]) -> CameraFile | None:
-    """That of the user, or else the one that ``run`` would find."""
-    if explicit is None:
-        folder = images if images.is_dir() else images.parent
-        return beside(paths[0].parent, folder, folder.absolute().parent)
-    return explicit_camera(explicit, ImageFiles(in_order(paths)))

@@ -67,60 +67,47 @@ class Ground:
 
 @dataclass(frozen=True)
 class Grid:
-    """Square cells of the x-y plane; row 0 has the largest y."""
+    """Square cells of the x-y plane, row by row from the smallest y; ``first`` ``(2,)`` counts from the origin."""
 
-    x_min: float
-    y_max: float
+    first: FloatArray
     width: int
     height: int
     resolution: float
 
     @classmethod
     def around(cls, points: FloatArray, resolution: float) -> Grid:
-        """The cells that points ``(P, 3)`` lie in; their borders are multiples of ``resolution``.
-
-        Raises:
-            RunError: too many cells.
-        """
+        """The cells that points ``(P, 3)`` lie in; their borders are multiples of ``resolution``."""
         # rounded, so that an edge on a border of cells does not begin another row
         low = np.floor((points[:, :2].min(axis=0) / resolution).round(_BORDER_DECIMALS))
         high = np.ceil((points[:, :2].max(axis=0) / resolution).round(_BORDER_DECIMALS))
-        width, height = np.maximum(high - low, 1.0).tolist()
+        width, height = (int(size) for size in np.maximum(high - low, 1.0))
         if width * height > _MOST_CELLS:
             raise RunError(
-                f"--resolution {resolution:g} gives {width:.0f} x {height:.0f} cells, more than {_MOST_CELLS:,}: "
+                f"--resolution {resolution:g} gives {width} x {height} cells, more than {_MOST_CELLS:,}: "
                 "give a larger one"
             )
-        y_max = float(low[1] + height) * resolution
-        return cls(round(float(low[0]) * resolution, 9), round(y_max, 9), int(width), int(height), resolution)
+        return cls(low, width, height, resolution)
 
     @property
-    def y_min(self) -> float:
-        """The lower border."""
-        return round(self.y_max - self.height * self.resolution, 9)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.height, self.width
+    def corner(self) -> FloatArray:
+        """Smallest x and y ``(2,)``."""
+        return (self.first * self.resolution).round(9)
 
     def cells(self, points: FloatArray) -> NDArray[np.int64]:
         """Flat numbers ``(P,)`` of the cells of points ``(P, 2 or 3)``."""
-        column = np.floor((points[:, 0] - self.x_min) / self.resolution).astype(np.int64)
-        row = np.floor((self.y_max - points[:, 1]) / self.resolution).astype(np.int64)
-        return np.clip(row, 0, self.height - 1) * self.width + np.clip(column, 0, self.width - 1)
+        places = np.floor(points[:, :2] / self.resolution - self.first)
+        column, row = np.clip(places, 0, [self.width - 1, self.height - 1]).astype(np.int64).T
+        return np.asarray(row * self.width + column)
 
     def centres(self, cells: NDArray[np.int64]) -> FloatArray:
         """Centres ``(C, 2)`` of cells by their flat numbers."""
         row, column = np.divmod(cells, self.width)
-        x = self.x_min + (column + 0.5) * self.resolution
-        y = self.y_max - (row + 0.5) * self.resolution
-        return np.stack([x, y], axis=1)
+        return np.asarray((self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution, np.float64)
 
 
 def occupancy_grid(
     mesh: Ply, T_world_camera: FloatArray, resolution: float, is_metric: bool
-) -> tuple[NDArray[np.uint8], Grid]:
+) -> tuple[NDArray[np.uint8], FloatArray]:
     """Sort the surface of each cell by its height above the local ground.
 
     Args:
@@ -130,15 +117,14 @@ def occupancy_grid(
         is_metric: whether lengths are metres; else they are camera heights.
 
     Returns:
-        ``FREE``, ``OCCUPIED`` or ``UNKNOWN`` of each cell ``(H, W)``, largest y first, and where the cells lie.
-
-    Raises:
-        RunError: there is no ground below the cameras, or there are too many cells.
+        ``FREE``, ``OCCUPIED`` or ``UNKNOWN`` of each cell ``(H, W)``, largest y first, and x and y of the outer corner
+        at the bottom left ``(2,)``.
     """
     metre = 1.0 if is_metric else 1.0 / _USUAL_CAMERA_HEIGHT_M
     ground = ground_along(mesh.points, T_world_camera, _USUAL_CAMERA_HEIGHT_M * metre)
     grid = Grid.around(mesh.points, resolution)
-    free, occupied = np.zeros(grid.width * grid.height), np.zeros(grid.width * grid.height)
+    shape = (grid.height, grid.width)
+    free, occupied = np.zeros(shape).ravel(), np.zeros(shape).ravel()
     for points, areas in samples(mesh, resolution):
         cells = grid.cells(points)
         touched, which = np.unique(cells, return_inverse=True)
@@ -147,13 +133,13 @@ def occupancy_grid(
         standing = (above >= OBSTACLE_FROM_M * metre) & (above <= OBSTACLE_TO_M * metre)
         for total, chosen in ((free, on_ground), (occupied, standing)):
             total += np.bincount(cells[chosen], areas[chosen], len(total))
-    is_free = (free >= _MIN_FREE_AREA * resolution**2).reshape(grid.shape).astype(np.uint8)
+    is_free = (free >= _MIN_FREE_AREA * resolution**2).reshape(shape).astype(np.uint8)
     hole = max(int(_HOLE_M * metre / resolution), 1)
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (hole, hole))
-    values = np.full(grid.shape, UNKNOWN, np.uint8)
+    values = np.full(shape, UNKNOWN, np.uint8)
     values[cv2.morphologyEx(is_free, cv2.MORPH_CLOSE, element) > 0] = FREE
-    values[(occupied >= _MIN_OCCUPIED_AREA * resolution**2).reshape(grid.shape)] = OCCUPIED
-    return values, grid
+    values[(occupied >= _MIN_OCCUPIED_AREA * resolution**2).reshape(shape)] = OCCUPIED
+    return np.ascontiguousarray(values[::-1]), grid.corner
 
 
 def samples(mesh: Ply, resolution: float) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -174,15 +160,9 @@ def samples(mesh: Ply, resolution: float) -> Iterator[tuple[FloatArray, FloatArr
 
 
 def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: float) -> Ground:
-    """Fit the ground.
+    """The ground by points of the map ``(P, 3)``, z up, under cameras ``(N, 4, 4)`` in the same axes.
 
-    Args:
-        points: of the map ``(P, 3)``, z up.
-        T_world_camera: poses ``(N, 4, 4)`` in the same axes.
-        camera_height: a first guess, which the map then corrects.
-
-    Raises:
-        RunError: there is no map below the cameras.
+    ``camera_height`` is a first guess, which the map then corrects.
     """
     chosen = moved_rows(T_world_camera, _ANCHOR_STEP * camera_height, math.inf)
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]
@@ -199,60 +179,42 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
     if not medians:
         raise RunError("the map has no ground below the cameras, so free and occupied cannot be told apart")
     height = float(np.median(medians))
-    anchors, slopes = [], []
-    for (near, depth), camera, axis in zip(around(), cameras, up, strict=True):
-        ground = near[np.abs(depth - height) < _BAND * height]
-        start = camera - height * axis
-        anchor, slope = _plane(ground, start, -axis[:2] / axis[2], _RADIUS * height)
-        anchors.append(anchor)
-        slopes.append(slope)
-    return Ground(np.array(anchors), np.array(slopes), _REACH * height)
+    planes = [
+        _plane(near[np.abs(depth - height) < _BAND * height], camera - height * axis, -axis[:2] / axis[2], height)
+        for (near, depth), camera, axis in zip(around(), cameras, up, strict=True)
+    ]
+    anchors, slopes = map(np.array, zip(*planes))
+    return Ground(anchors, slopes, _REACH * height)
 
 
-def write_ros_map(
-    path: Path, cells: NDArray[np.uint8], corner: tuple[float, float], resolution: float, unit: str
-) -> None:
-    """Write ``<name>.pgm`` and, after it, ``<name>.yaml``, each atomically.
+def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: FloatArray, resolution: float, unit: str) -> None:
+    """Write a grid as `occupancy_grid` gives it: ``<name>.pgm`` and, after it, ``<name>.yaml``, each atomically.
 
-    Args:
-        path: the YAML file.
-        cells: ``(H, W)`` of `FREE`, `OCCUPIED` and `UNKNOWN`; the first row has the largest y.
-        corner: x and y of the outer corner at the bottom left.
-        resolution: side of a cell.
-        unit: of lengths, which ``map_server`` takes for metres: a comment says so.
-
-    Raises:
-        RunError: a file cannot be written.
+    ``map_server`` takes lengths for metres, whatever their ``unit`` is: a comment says so.
     """
-    height, width = cells.shape
     image = path.with_suffix(".pgm")
-    content = f"P5\n{width} {height}\n255\n".encode("ascii") + np.ascontiguousarray(cells).tobytes()
+    content = cv2.imencode(".pgm", cells)[1].tobytes()
     write_atomically(image, lambda partial: partial.write_bytes(content), RunError)
-    description = {
-        "image": image.name,
-        "resolution": resolution,
-        "origin": [*corner, 0.0],
-        "negate": 0,
-        **_THRESHOLDS,
-    }
-    text = f"# lengths in {unit}\n" + yaml.safe_dump(description, sort_keys=False, default_flow_style=None)
+    description = {"image": image.name, "resolution": resolution, "origin": [*corner.tolist(), 0.0], "negate": 0}
+    text = yaml.safe_dump(description | _THRESHOLDS, sort_keys=False, default_flow_style=None)
+    text = f"# lengths in {unit}\n{text}"
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), RunError)
 
 
-def _plane(points: FloatArray, start: FloatArray, tilt: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
+def _plane(points: FloatArray, start: FloatArray, tilt: FloatArray, height: float) -> tuple[FloatArray, FloatArray]:
     """A robust plane through points, near the one through ``start`` with slope ``tilt``: its point and slope."""
     if len(points) < _MIN_POINTS:
         return start, tilt
-    places = (points[:, :2] - start[:2]) / radius
-    residual_of = points[:, 2] - start[2] - (points[:, :2] - start[:2]) @ tilt
-    design = np.column_stack([np.ones(len(points)), places])
+    offsets = points[:, :2] - start[:2]
+    residual_of = points[:, 2] - start[2] - offsets @ tilt
+    design = np.column_stack([np.ones(len(points)), offsets / (_RADIUS * height)])
     prior = np.diag([0.0, 1.0, 1.0]) * _TILT_PRIOR * len(points)
     change = np.array([np.median(residual_of), 0.0, 0.0])
     for _ in range(_LEAST_SQUARES_ROUNDS):
-        ratio = (residual_of - design @ change) / (_TUKEY * radius / _RADIUS)
+        ratio = (residual_of - design @ change) / (_TUKEY * height)
         weights = np.clip(1 - ratio**2, 0, None) ** 2
         if weights.sum() < _MIN_POINTS / 2:
             return start, tilt
         weighted = design * weights[:, None]
         change = np.linalg.solve(weighted.T @ design + prior, weighted.T @ residual_of)
-    return start + np.array([0.0, 0.0, change[0]]), tilt + change[1:] / radius
+    return start + np.array([0.0, 0.0, change[0]]), tilt + change[1:] / (_RADIUS * height)

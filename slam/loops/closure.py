@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.threads import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray
 from slam.loops.consistency import Track, agreeing
 from slam.loops.retrieval import Apart, find_candidates
 from slam.loops.verification import OF_FRAMES, Loop, LoopVerifier, RejectedLoop
-from slam.runtime.threads import side_by_side
 
 logger = logging.getLogger(__name__)
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from erfsfm.common.threads import side_by_side
 from slam.frames import Descriptors, View
 from slam.geometry.se3 import FloatArray
 from slam.loops.descriptors import hamming
 from slam.loops.verification import LoopThresholds
-from slam.runtime.threads import side_by_side
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3

@@ -8,6 +8,7 @@ from contextlib import closing
 import numpy as np
 
 from erfsfm.common.progress import Progress
+from erfsfm.common.threads import CORES, read_ahead
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import MappingConfig, SlamConfig
 from slam.frames import Intrinsics
@@ -18,7 +19,6 @@ from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.estimate import Estimate
-from slam.runtime.threads import CORES, read_ahead
 
 # relative sigma of learned depth in rooms, in the unit of the drive: 90 % of the errors are within 1.645 sigmas
 _ROOM_SIGMA = 0.32

@@ -11,6 +11,7 @@ from threading import Event
 
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import calling_on_signals
+from erfsfm.common.threads import read_ahead
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
@@ -47,7 +48,6 @@ from slam.pipeline.observer import Observations, Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside
-from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.sequences.recording import RecordedSequence
 

@@ -53,7 +53,7 @@ def estimate_metrics(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),
             optimised=trajectory_metrics(result.optimised, result.reference),
-            lidar=_lidar_metrics(result, sequence),
+            lidar=_lidar_metrics(result),
         ),
         gps=_gps(result, gps_in_graph),
         graph=_graph(result),
@@ -107,15 +107,13 @@ def _stretches(reasons: Mapping[int, str]) -> list[records.Stretch]:
     return [records.Stretch(first=first, last=last, reason=reasons[first]) for first, last in runs(reasons)]
 
 
-def _lidar_metrics(result: Estimate, sequence: Sequence) -> TrajectoryMetrics | Failed:
+def _lidar_metrics(result: Estimate) -> TrajectoryMetrics | Failed:
     """Errors of LiDAR odometry at its frames."""
-    path, lidar = result.lidar, lidar_trajectory(result)
-    if isinstance(path, Failed):
-        return path
-    if path is None or lidar is None:
-        return Failed("the sequence has no LiDAR scans")
+    path = result.lidar
+    if not isinstance(path, LidarPath):
+        return path or Failed("the sequence has no LiDAR scans")
     reference = None if result.reference is None else result.reference.select(path.frames).rebased()
-    return trajectory_metrics(lidar, reference)
+    return trajectory_metrics(Trajectory(result.optimised.stamps[path.frames], path.T_world_camera), reference)
 
 
 def _network_snippets(result: Estimate) -> SnippetErrors | None:

@@ -9,7 +9,7 @@ import itertools
 import logging
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 from html import escape
@@ -62,7 +62,7 @@ class RunFolder:
             output.mkdir(parents=True, exist_ok=True)
             # last of all the file by which it is known as a run
             for path in sorted(output.iterdir(), key=lambda path: path.name == METRICS):
-                if path.name in MEANINGS or _is_rest(path):
+                if path.name in MEANINGS or unfinished_name(path) in MEANINGS:
                     path.unlink()
             return cls(output)
         except OSError as error:
@@ -104,11 +104,7 @@ class RunFolder:
         write_tum(self.path / trajectory_file(name, "tum"), trajectory)
 
     def metrics(self) -> Metrics:
-        """The content of ``metrics.json``; without the file, the status of a killed run.
-
-        Raises:
-            RunError: the file is damaged.
-        """
+        """The content of ``metrics.json``; without the file, the status of a killed run."""
         try:
             return Metrics.read(self.path / METRICS)
         except FileNotFoundError:
@@ -141,11 +137,7 @@ class RunFolder:
         return f"<h4>{escape(title)}</h4>{table}" + "".join(f"<p>{escape(note)}</p>" for note in notes)
 
     def require(self, name: str) -> Path:
-        """The path of a file of the run.
-
-        Raises:
-            RunError: it is not there.
-        """
+        """The path of a file of the run."""
         path = self.path / name
         if not path.is_file():
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
@@ -159,51 +151,35 @@ class RunFolder:
         return (metrics.failure or "it ran without a map") if why == NOT_RECORDED else why
 
 
-def check_replaced(path: Path, beginnings: Mapping[str, bytes] | None = None) -> None:
-    """Check what a file would replace.
-
-    Args:
-        path: the file to write.
-        beginnings: ends of the names that it may have, and how such files begin; None of any trajectory.
-
-    Raises:
-        RunError: a folder, a file of a run, or one of another kind.
-    """
+def check_replaced(path: Path, begin: bytes | None = None) -> None:
+    """Check what a file would replace: a file with this ``begin``, by default any trajectory."""
     if path.is_dir():
         raise RunError(f"{path} is a folder: give the name of a file to write")
     if path.name in MEANINGS and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
         raise RunError(f"{path} is a file of a run: choose another --output")
-    if path.is_file() and path.stat().st_size and not _is_of_kind(path, beginnings):
+    if path.is_file() and path.stat().st_size and not _is_of_kind(path, begin):
         raise RunError(f"{path} exists and is a file of another kind than is written: choose another --output")
 
 
-def _is_of_kind(path: Path, beginnings: Mapping[str, bytes] | None) -> bool:
-    suffix = path.suffix.lower()
-    if suffix not in (_TRAJECTORIES if beginnings is None else beginnings):
-        return False
-    if beginnings is not None:
+def _is_of_kind(path: Path, begin: bytes | None) -> bool:
+    if begin is not None:
         with path.open("rb") as file:
-            return file.read(64).startswith(beginnings[suffix])
+            return file.read(len(begin)) == begin
     try:
-        read_trajectory(path)
+        return path.suffix.lower() in _TRAJECTORIES and len(read_trajectory(path)) > 0
     except TrajectoryError:
         return False
-    return True
 
 
 def check_output(output: Path) -> None:
-    """Check that a run may write to ``output``: it is new, empty, or holds an earlier run.
-
-    Raises:
-        RunError: it is a file, or holds files of something else.
-    """
+    """Check that a run may write to ``output``: it is new, empty, or holds an earlier run."""
     if output.is_symlink() and not output.exists():
         raise RunError(f"{output} is a link to {output.readlink()}, which is not there: choose another --output")
     if not output.exists():
         return
     if not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
-    if not _is_run(output / METRICS) and any(not _is_rest(path) for path in output.iterdir()):
+    if not _is_run(output / METRICS) and any(unfinished_name(path) not in MEANINGS for path in output.iterdir()):
         raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
 
 
@@ -228,11 +204,6 @@ def _is_run(metrics: Path) -> bool:
     except (OSError, RunError):
         return False
     return content.provenance.weights_sha256 is not None and {"schema_", "status"} <= content.model_fields_set
-
-
-def _is_rest(path: Path) -> bool:
-    """Whether it is a partial file of a killed run."""
-    return unfinished_name(path) in MEANINGS
 
 
 def _link(link: Path, target: Path) -> None:

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from slam.config.sections import ScaleMode
 from slam.evaluation.depth import DepthMetrics
-from slam.evaluation.map import ERRORS, PlacedMetrics
+from slam.evaluation.map import PlacedMetrics
 from slam.evaluation.trajectory import TrajectoryMetrics
 from slam.runtime.storage.record import Count, Record, part
 
@@ -218,14 +218,6 @@ class MapMetrics(PlacedMetrics):
     truth: str | None = None
     evaluated_m: float | None = None
     with_scale: PlacedMetrics = part(PlacedMetrics)
-
-
-SIZES = (
-    *("triangles", "points", "blocks", "submaps", "frames_fused", "frames_left_out", "voxel_size", "filters"),
-    *("floater_share", "double_wall_share"),
-)
-MAP_ERRORS = (*ERRORS, "truth", "evaluated_m", "with_scale")
-"""The values of `MapMetrics` that the map alone gives, and those of its comparison with the truth."""
 
 
 class Metrics(Record):

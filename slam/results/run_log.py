@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 
 class RunLog(logging.Handler):
@@ -18,17 +19,16 @@ class RunLog(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self._kept: list[logging.LogRecord] = []
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        self._waiting: list[logging.LogRecord] = []
         self._times: Counter[tuple[str, str]] = Counter()
-        self._file: _QuietFile | None = None
+        self._file: TextIO | None = None
 
     def begin(self, path: Path) -> None:
         """Write the buffered and all further records to a file."""
-        self._file = _QuietFile(path, encoding="utf-8", errors="backslashreplace")
-        self._file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        for record in self._kept:
-            self._file.emit(record)
-        self._kept.clear()
+        self._file = path.open("a", encoding="utf-8", errors="backslashreplace")
+        for record in self._waiting:
+            self._write(record)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write or buffer a record."""
@@ -37,35 +37,32 @@ class RunLog(logging.Handler):
             self._times[record.msg, reason] += 1
             if self._times[record.msg, reason] > 1:
                 return
-        if self._file is None:
-            self._kept.append(record)
-        else:
-            self._file.emit(record)
+        self._write(record)
 
     def failed(self, reason: str) -> None:
         """Write the reason of a failure to the file alone: the caller gets the exception."""
         self._say(logging.ERROR, f"the run failed: {reason}")
 
-    def _say(self, level: int, message: str) -> None:
-        self.handle(logging.LogRecord("slam.commands.run.run", level, __file__, 0, message, None, None))
-
     def close(self) -> None:
         """Write how often reasons were given again and again, and close the file."""
+        for (_, reason), times in self._times.items():
+            if times > 1:
+                self._say(logging.INFO, f"{times} times: {reason}")
         if self._file is not None:
-            for (_, reason), times in self._times.items():
-                if times > 1:
-                    self._say(logging.INFO, f"{times} times: {reason}")
-            self._file.close()
+            with suppress(OSError):  # flushes again what a full disk refused
+                self._file.close()
         super().close()
 
+    def _say(self, level: int, message: str) -> None:
+        self._write(logging.LogRecord("slam.commands.run", level, __file__, 0, message, None, None))
 
-class _QuietFile(logging.FileHandler):
-    def handleError(self, record: logging.LogRecord) -> None:
-        pass
-
-    def close(self) -> None:
-        with suppress(OSError):  # flushes again what a full disk refused
-            super().close()
+    def _write(self, record: logging.LogRecord) -> None:
+        if self._file is None:
+            self._waiting.append(record)
+            return
+        with suppress(Exception):
+            self._file.write(f"{self.format(record)}\n")
+            self._file.flush()
 
 
 @contextmanager

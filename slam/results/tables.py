@@ -73,15 +73,14 @@ def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
 
 
 def runs_table(runs: Sequence[RunFolder]) -> Table:
-    """One row for each run and trajectory; runs that failed or were killed with the reason.
-
-    Raises:
-        RunError: a ``metrics.json`` is damaged.
-    """
+    """One row for each run and trajectory; runs that failed or were killed with the reason."""
     rows: list[list[str]] = []
     notes: dict[str, None] = {UNITS: None}
-    for name, metrics in zip(_names(runs), (run.metrics() for run in runs)):
-        errors, title = metrics.evaluated_errors(), name
+    names = [run.path.resolve().name for run in runs]
+    for run, short in zip(runs, names, strict=True):
+        title = name = str(run.path) if names.count(short) > 1 else short
+        metrics = run.metrics()
+        errors = metrics.evaluated_errors()
         if metrics.failure:
             ended = "failed" if metrics.status == "failed" else "did not end"
             title += f", {ended}"
@@ -100,11 +99,7 @@ def runs_table(runs: Sequence[RunFolder]) -> Table:
 
 
 def runs_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
-    """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory.
-
-    Raises:
-        RunError: a ``metrics.json`` is damaged.
-    """
+    """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory."""
     objects = []
     for run in runs:
         metrics = run.metrics()
@@ -136,9 +131,3 @@ def missing_errors(trajectories: Mapping[str, TrajectoryMetrics]) -> str:
 
 def _numbers(errors: TrajectoryMetrics) -> list[str]:
     return [written(errors.at(column.path)[0], column.decimals) for column in COLUMNS]
-
-
-def _names(runs: Sequence[RunFolder]) -> list[str]:
-    """Short names of runs: the folder's own, or the whole path where it is not unique."""
-    names = [run.path.resolve().name for run in runs]
-    return [str(run.path) if names.count(name) > 1 else name for run, name in zip(runs, names)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,37 +16,28 @@ from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.estimate import Estimate
-from slam.results.metrics import MAP_ERRORS, DepthOfKeyframes, MapMetrics
+from slam.results.metrics import DepthOfKeyframes, MapMetrics
 from slam.runtime.errors import Failed, SlamError
+from slam.sequences.recording import RecordedSequence
+from slam.sequences.simulated import SimulatedSequence
 
 logger = logging.getLogger(__name__)
 
+_MAP_ERRORS = (*ERRORS, "truth", "evaluated_m", "with_scale")
 _NEAREST_M = 0.1  # z-depth of a LiDAR point that can be in the image
 _DEPTH_RANGE_M = 50.0
 _MOST_PIXELS = 70_000  # of a depth map; larger ones are sampled
 _EVERY_RENDERED = 5  # rendering a keyframe's true depth takes as long as refining it
 
 
-@runtime_checkable
-class HasTrueDepth(Protocol):
-    """A sequence that may have true depth beside its images."""
-
-    def true_depth_frames(self) -> range | list[int]:
-        """Frames that have it, increasing."""
-
-    def true_depth(self, index: int) -> FloatArray:
-        """Z-depth ``(h, w)`` of one of them in metres, 0 where unknown."""
-
-
 class DepthTruth:
     """Depth maps at true poses; ``distance`` is exact where the surface itself is known."""
 
-    def __init__(self, sequence: Sequence, depth: HasTrueDepth) -> None:
-        """``depth`` is the sequence itself."""
-        self._depth = depth
-        self._intrinsics, self._poses = sequence.intrinsics, sequence.reference
-        self.frames: Indices = np.asarray(depth.true_depth_frames(), dtype=np.int64)
-        exact, T_any_camera = getattr(depth, "distance_to_surface", None), getattr(depth, "T_any_camera", None)
+    def __init__(self, sequence: RecordedSequence) -> None:
+        """The depth maps of a sequence with true poses."""
+        self._sequence = sequence
+        self.frames: Indices = np.asarray(sequence.true_depth_frames(), dtype=np.int64)
+        exact, T_any_camera = sequence.distance_to_surface, sequence.T_any_camera
         self.name = "depth maps" if exact is None else "exact surface"
         self.distance: Callable[[FloatArray], FloatArray] | None = None
         if exact is not None and T_any_camera is not None:
@@ -55,15 +45,15 @@ class DepthTruth:
 
     def view(self, frame: int) -> Surface:
         """Surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m."""
-        assert self._poses is not None
-        depth = self._depth.true_depth(frame)
+        assert self._sequence.reference is not None
+        T_world_camera, depth = self._sequence.reference[frame], self._sequence.true_depth(frame)
         height, width = depth.shape
-        camera = Intrinsics.of(self._intrinsics.resized(width, height))
+        camera = Intrinsics.of(self._sequence.intrinsics.resized(width, height))
         step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
         offset = frame % step  # other pixels in neighbouring frames
         rays = camera.rays(camera.pixel_grid()[offset::step, offset::step])
-        points = backprojected(depth[offset::step, offset::step], rays, self._poses[frame], _DEPTH_RANGE_M)
-        return Surface(points, np.linalg.norm(points - self._poses[frame][:3, 3], axis=1) <= RANGE_M)
+        points = backprojected(depth[offset::step, offset::step], rays, T_world_camera, _DEPTH_RANGE_M)
+        return Surface(points, np.linalg.norm(points - T_world_camera[:3, 3], axis=1) <= RANGE_M)
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:
         """All, for the map comes from the same images."""
@@ -84,9 +74,8 @@ class LidarTruth:
     def __init__(self, sequence: Sequence) -> None:
         """The scans of a sequence with true poses."""
         self._sequence = sequence
-        scanned = [k for k in range(len(sequence)) if sequence.has_scan(k)]
-        self.frames: Indices = np.array(scanned, dtype=np.int64)
-        self._limits: dict[int, tuple[float, float]] = {}
+        self.frames: Indices = np.array([k for k in range(len(sequence)) if sequence.has_scan(k)], dtype=np.int64)
+        self._limits: dict[int, tuple[float, float]] = {}  # sines of the lowest and the highest beam
 
     def view(self, frame: int) -> Surface:
         """The points of one scan; points that project into its image are in the image."""
@@ -96,7 +85,9 @@ class LidarTruth:
         if isinstance(points, str):
             points = np.empty((0, 3))
         ranges = np.linalg.norm(points, axis=1)
-        self._limits[frame] = _elevations(points, ranges)
+        sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
+        beams = np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)  # stray points left out
+        self._limits[frame] = float(beams[0]), float(beams[1])
         points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
         return Surface(apply(sequence.reference[frame], points), _in_image(points, sequence.intrinsics))
 
@@ -125,27 +116,14 @@ def _in_image(points: FloatArray, camera: Intrinsics) -> Mask:
     return inside
 
 
-def _elevations(points: FloatArray, ranges: FloatArray) -> tuple[float, float]:
-    """Sines of the lowest and the highest beam of a scan, stray points left out."""
-    sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
-    if len(sines) == 0:
-        return 1.0, -1.0
-    low, high = np.quantile(sines, [0.001, 0.999])
-    return float(low), float(high)
-
-
 def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     """The best truth of a sequence, or why there is none."""
     if sequence.reference is None:
         return "the sequence has no true poses"
-    if isinstance(sequence, HasTrueDepth):
-        depth = DepthTruth(sequence, sequence)
-        if len(depth.frames):
-            return depth
-    if sequence.T_camera_lidar is not None:
-        lidar = LidarTruth(sequence)
-        if len(lidar.frames):
-            return lidar
+    if isinstance(sequence, RecordedSequence) and sequence.true_depth_frames():
+        return DepthTruth(sequence)
+    if sequence.T_camera_lidar is not None and (lidar := LidarTruth(sequence)).frames.size:
+        return lidar
     return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
 
 
@@ -157,15 +135,12 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
     """
     truth = find_truth(sequence)
     if isinstance(truth, str):
-        return MapMetrics.unknown(truth, *MAP_ERRORS)
+        return MapMetrics.unknown(truth, *_MAP_ERRORS)
     assert sequence.reference is not None
-    fits = {
-        "rigid": pose_similarity(sequence.reference, result.optimised.T_world_camera, with_scale=False),
-        "with_scale": pose_similarity(sequence.reference, result.optimised.T_world_camera),
-    }
-    unmetric = not result.scale.is_metric
-    if unmetric:
-        del fits["rigid"]
+    poses = result.optimised.T_world_camera
+    fits = {"with_scale": pose_similarity(sequence.reference, poses)}
+    if result.scale.is_metric:
+        fits["rigid"] = pose_similarity(sequence.reference, poses, with_scale=False)
     looked_at = np.concatenate([*stretches(sequence.reference, truth.frames), np.empty(0, np.int64)]).astype(np.int64)
     cameras = cKDTree(sequence.reference[looked_at, :3, 3])
     placed = {name: _placed(pieces(), fit, cameras) for name, fit in fits.items()}
@@ -173,12 +148,12 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
         distances, length_m = compare(truth, sequence.reference, placed)
     except SlamError as error:
         logger.warning("the error of the map is not known: %s", error)
-        return MapMetrics.unknown(str(error), *MAP_ERRORS)
+        return MapMetrics.unknown(str(error), *_MAP_ERRORS)
     if truth.distance is None and len(distances["with_scale"].to_map) == 0:
-        return MapMetrics.unknown("no point of the true surface is known near the images", *MAP_ERRORS)
+        return MapMetrics.unknown("no point of the true surface is known near the images", *_MAP_ERRORS)
     with_scale = placed_metrics(PlacedMetrics, distances["with_scale"], scale=fits["with_scale"].scale)
     more = {"truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
-    if unmetric:
+    if "rigid" not in fits:
         return MapMetrics.of(**dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale")), **more)
     return placed_metrics(MapMetrics, distances["rigid"], **more)
 
@@ -224,29 +199,28 @@ class DepthQuality:
         unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
         if self._unreadable:
             logger.warning("%s, first %s: they are not compared", unreadable, self._unreadable[0])
-        missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
-        if self._unreadable:
-            missing = unreadable
         if self._keyframes == 0:
             missing = "there are no keyframes (mapping.enabled)"
         elif not self._is_metric:
             missing = "depth is not in metres (see scale)"
-        elsewhere = "no keyframe has a neighbour at a useful distance" if is_refined else "depth.refine is none"
-        why_not_refined = missing if network is None else elsewhere
-        return DepthOfKeyframes.of(network=network or Failed(missing), refined=refined or Failed(why_not_refined))
+        elif self._unreadable:
+            missing = unreadable
+        else:
+            missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
+        if network is None:
+            return DepthOfKeyframes.unknown(missing)
+        unrefined = "no keyframe has a neighbour at a useful distance" if is_refined else "depth.refine is none"
+        return DepthOfKeyframes.of(network=network, refined=refined or Failed(unrefined))
 
 
 def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | None:
     """The true z-depth ``(H, W)`` of a frame, 0 where unknown; None without any.
 
     Of a simulated street only every fifth ``count`` is rendered.
-
-    Raises:
-        SlamError: a depth map or a scan cannot be read.
     """
-    if getattr(sequence, "street", None) is not None and count % _EVERY_RENDERED != 1:
+    if isinstance(sequence, SimulatedSequence) and count % _EVERY_RENDERED != 1:
         return None
-    if isinstance(sequence, HasTrueDepth) and index in sequence.true_depth_frames():
+    if isinstance(sequence, RecordedSequence) and index in sequence.true_depth_frames():
         return np.asarray(sequence.true_depth(index), np.float32)
     if sequence.T_camera_lidar is None or not sequence.has_scan(index):
         return None

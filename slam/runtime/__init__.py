@@ -1,1 +1,1 @@
-"""Time, threads and imports of heavy libraries."""
+"""Time, errors and imports of heavy libraries."""

@@ -30,14 +30,6 @@ class MissingFrameError(SequenceError):
     """A frame whose number is missing from the files of a sequence: a gap in time, which is interpolated."""
 
 
-class CalibrationError(SlamError):
-    """Images of a board do not give a camera."""
-
-
-class DownloadError(SlamError):
-    """A data set cannot be fetched from its server."""
-
-
 class TrajectoryError(SlamError):
     """A trajectory file cannot be read, or two trajectories do not match."""
 

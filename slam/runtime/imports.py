@@ -10,18 +10,14 @@ from threading import Thread
 from types import ModuleType
 from typing import Any
 
-from slam.runtime.errors import DownloadError, SequenceError, SlamError
+from slam.runtime.errors import SlamError
 
-# of each optional extra: what needs it, its modules, and the error where one of them cannot be loaded
-EXTRAS: dict[str, tuple[str, tuple[str, ...], type[SlamError]]] = {
-    "cluster": ("several workers and schedulers need Dask", ("distributed",), SlamError),
-    "download": (
-        "download needs remotezip and requests",
-        ("remotezip", "requests", "urllib3.exceptions"),
-        DownloadError,
-    ),
-    "rerun": ("--rerun and --view need rerun", ("rerun",), SlamError),
-    "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys"), SequenceError),
+# of each optional extra: what needs it, and its modules
+EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "cluster": ("several workers and schedulers need Dask", ("distributed",)),
+    "download": ("download needs remotezip and requests", ("remotezip", "requests", "urllib3.exceptions")),
+    "rerun": ("--rerun and --view need rerun", ("rerun",)),
+    "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")),
 }
 
 _WINDOWS = "open3d.visualization"
@@ -29,11 +25,7 @@ _WINDOWS = "open3d.visualization"
 
 @functools.cache
 def import_open3d() -> ModuleType:
-    """Import Open3D, loading the libusb that its wheels link but do not ship.
-
-    Raises:
-        SlamError: if Open3D or libusb-package is not installed or cannot be loaded.
-    """
+    """Import Open3D, loading the libusb that its wheels link but do not ship."""
     try:
         libusb_package = importlib.import_module("libusb_package")
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
@@ -65,16 +57,12 @@ def _without_windows() -> ModuleType:
 
 
 def import_extra(extra: str) -> tuple[ModuleType, ...]:
-    """Import the modules of an optional extra of the package, in the order of `EXTRAS`.
-
-    Raises:
-        SlamError: one of them is not installed or cannot be loaded.
-    """
-    needs, modules, error_type = EXTRAS[extra]
+    """Import the modules of an optional extra of the package, in the order of `EXTRAS`."""
+    needs, modules = EXTRAS[extra]
     try:
         return tuple(importlib.import_module(name) for name in modules)
     except (ImportError, OSError) as error:
-        raise error_type(f"{needs} ({error}): pip install 'erfsfm-slam[{extra}]'") from error
+        raise SlamError(f"{needs} ({error}): pip install 'erfsfm-slam[{extra}]'") from error
 
 
 @functools.cache
@@ -84,11 +72,7 @@ def plug_ins(group: str) -> dict[str, EntryPoint]:
 
 
 def import_plug_in(point: EntryPoint) -> Any:
-    """What an entry point names.
-
-    Raises:
-        SlamError: its package cannot be loaded.
-    """
+    """What an entry point names."""
     try:
         return point.load()
     except (ImportError, AttributeError, OSError) as error:

@@ -91,7 +91,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         r"train-fusion|runs/fusion|--seed 1[01]00",
         "it wants worlds; tests/erfsfm/training/test_fusion.py has small ones",
     ),
-    (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/live has folders and videos that go on"),
+    (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/test_live.py has folders and videos that go on"),
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
     (r"--dataset walk ", "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances"),
     (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/commands/localisation has short ones"),

@@ -11,7 +11,7 @@ import pytest
 
 from erfsfm.common.errors import SHOW_TRACEBACK
 from slam import run_slam
-from slam.commands.live.run import LiveRequest, run_live
+from slam.commands.live import LiveRequest, run_live
 from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import is_se3
 from slam.results.folder import RunFolder

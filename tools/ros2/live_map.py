@@ -69,4 +69,4 @@ class LiveMap:
             seen[cells] += stands | lies
             occupied[cells] += stands
         percent = np.where(seen > 0, 100 * occupied / np.maximum(seen, 1), UNKNOWN)
-        return percent.round().astype(np.int8).reshape(grid.shape)[::-1], grid
+        return percent.round().astype(np.int8).reshape(grid.height, grid.width), grid

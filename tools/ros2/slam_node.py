@@ -220,7 +220,7 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
             self._say(str(error))
             return
         T_map_corner = np.eye(4)
-        T_map_corner[:2, 3] = grid.x_min, grid.y_min
+        T_map_corner[:2, 3] = grid.corner
         size = {"resolution": grid.resolution, "width": grid.width, "height": grid.height}
         info = MapMetaData(map_load_time=header.stamp, origin=pose_of(T_map_corner), **size)
         self._grid.publish(OccupancyGrid(header=header, info=info, data=array("b", cells.tobytes())))

@@ -30,11 +30,7 @@ class FrameRange:
 
     @staticmethod
     def parse(name: str) -> FrameRange:
-        """Read a name; raw drives lose their ``_sync``.
-
-        Raises:
-            ConfigError: brackets that hold no range, or an empty one.
-        """
+        """Read a name; raw drives lose their ``_sync``."""
         name = name.strip()
         match = _RANGED.fullmatch(name)
         if match is None:
@@ -49,7 +45,8 @@ class FrameRange:
 
     def counted_in(self, recording: str) -> FrameRange | None:
         """The same frames by the numbers of another recording of the drive; None where that has none of them."""
-        if _seed_spans_overlap(self.recording, recording):
+        a, b = seed_span(self.recording), seed_span(recording)
+        if a is not None and b is not None and a[0] <= b[1] and b[0] <= a[1]:
             return replace(self, recording=recording)
         drive, first, length = _drive(recording)
         own_drive, own_first, own_length = _drive(self.recording)
@@ -110,11 +107,6 @@ def _drive(recording: str) -> tuple[str, int, int]:
         return recording, 0, EVERYTHING
     drive, first, past_last = ODOMETRY_DRIVES[name]
     return f"kitti_raw/{drive}", first, past_last - first
-
-
-def _seed_spans_overlap(first: str, second: str) -> bool:
-    a, b = seed_span(first), seed_span(second)
-    return a is not None and b is not None and a[0] <= b[1] and b[0] <= a[1]
 
 
 def _seed_ranges(seeds: list[int]) -> list[str]:

@@ -34,11 +34,7 @@ _NUMBER = re.compile(r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)")  # a stamp suc
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files directly in a folder, in natural order (``2.png`` before ``10.png``).
-
-    Raises:
-        DataError: two files differ in their suffix alone.
-    """
+    """The image files directly in a folder, in natural order (``2.png`` before ``10.png``)."""
     if not folder.is_dir():
         return []
     paths = [path for path in folder.iterdir() if is_image(path)]
@@ -54,11 +50,7 @@ def has_images(folder: Path) -> bool:
 
 
 def image_folder(folder: Path) -> Path | None:
-    """The folder that holds the images: itself, or its one sub-folder of a usual name.
-
-    Raises:
-        DataError: several sub-folders qualify.
-    """
+    """The folder that holds the images: itself, or its one sub-folder of a usual name."""
     if has_images(folder):
         return folder
     found = [folder / name for name in IMAGE_FOLDERS if has_images(folder / name)]
@@ -118,9 +110,6 @@ def read_image(path: Path, stretch: Stretch | None = None) -> Image:
     """Read an image as ``(H, W, 3)`` uint8 RGB; grey is repeated to three channels.
 
     Values of 16 bits are stretched; without a ``stretch`` by their own range.
-
-    Raises:
-        DataError: missing, empty, truncated or no image; one line.
     """
     return decode_image(_file_bytes(path), f"image {path}", stretch)
 
@@ -184,12 +173,8 @@ def stretch_of(places: Sequence[T], read: Callable[[T], NDArray[Any]]) -> Stretc
 def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:
     """The first readable image, and its place: of three, one of the size of most.
 
-    Args:
-        places: of images of one size, as a rule: recorders and people put another picture in front.
-        read: one of them, or a one-line error.
-
-    Raises:
-        OneLineError: that of the first one, where none can be read.
+    Images have one size as a rule: recorders and people put another picture in front. Where ``read`` refuses all, its
+    error for the first is raised.
     """
     found: dict[tuple[int, ...], tuple[T, Image]] = {}
     for place in places:

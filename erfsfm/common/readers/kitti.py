@@ -94,11 +94,7 @@ def odometry_camera(folder: Path) -> int | None:
 
 
 def find_drives(dataset: Path) -> dict[str, Path]:
-    """Rectified drives by name (``2011_09_26_drive_0013``): the folder itself, those in it, or those in its dates.
-
-    Raises:
-        DataError: the folder is an unrectified (``_extract``) drive.
-    """
+    """Rectified drives by name (``2011_09_26_drive_0013``): the folder itself, those in it, or those in its dates."""
     own = _DRIVE.fullmatch(dataset.absolute().name)
     if own is not None:
         if own["kind"] == "extract":

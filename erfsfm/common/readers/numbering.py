@@ -59,13 +59,9 @@ class NumberedFiles:
         return f"{match['prefix']}{number:0{len(match['number'])}d}{path.suffix}"
 
     def rows_of(self, values: int) -> tuple[NDArray[np.intp], int] | None:
-        """Which rows a file beside these describes.
+        """Which rows a file beside these describes, and how many of its first ``values`` belong to none of them.
 
-        Args:
-            values: how many it has: one for each number from 0, one for each row, or one for each file.
-
-        Returns:
-            The rows, and how many of its first values belong to none of them; None where the count fits nothing.
+        It has one for each number from 0, for each row, or for each file; None where the count fits nothing.
         """
         if values in (len(self), self.first + len(self)):
             return np.arange(len(self)), values - len(self)
@@ -83,11 +79,7 @@ class NumberedFiles:
 
 
 def by_number(paths: list[Path]) -> NumberedFiles:
-    """Files that KITTI names by their number alone, at least one, in order.
-
-    Raises:
-        DataError: a name is no number, or two files have the same one.
-    """
+    """Files that KITTI names by their number alone, at least one, in order."""
     for path in paths:
         if not path.stem.isdecimal():
             raise DataError(f"{path} is not named by its number ({0:0{len(paths[0].stem)}d}{path.suffix}): rename it")
@@ -98,9 +90,6 @@ def by_name(paths: list[Path]) -> NumberedFiles:
     """A user's files, at least one, in order: gaps are detected where names end in numbers that go up one by one.
 
     Names without a number at their end, stamps and every-n-th-frame numbering have no gaps.
-
-    Raises:
-        DataError: two files have the same number.
     """
     matches = [_NUMBERED.fullmatch(path.stem) for path in paths]
     numbers = [int(match["number"]) for match in matches if match is not None]

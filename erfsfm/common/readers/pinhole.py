@@ -73,12 +73,7 @@ def impossible(camera: Pinhole) -> str | None:
 
 
 def require_plausible(camera: Pinhole, where: str) -> None:
-    """Refuse an impossible camera, and warn once of an unlikely one.
-
-    Args:
-        camera: as read.
-        where: the file, and the row of it, for the message.
-    """
+    """Refuse an impossible camera, and warn once of an unlikely one; ``where`` it was read is for the message."""
     problem = impossible(camera)
     if problem is not None:
         raise DataError(f"{where}: {problem}")

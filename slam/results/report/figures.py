@@ -34,13 +34,7 @@ _SKY = "#e2e8ef"
 def trajectories_figure(
     trajectories: Mapping[str, Trajectory], unit: str, loops: Sequence[AcceptedLoop] = ()
 ) -> go.Figure:
-    """Trajectories from above, `aligned`.
-
-    Args:
-        trajectories: by name.
-        unit: of their positions.
-        loops: accepted ones, whose places are marked on the optimised trajectory.
-    """
+    """Trajectories from above, `aligned`; places of accepted loops are marked on the optimised one."""
     trajectories = aligned(trajectories)
     figure = go.Figure()
     for name, trajectory in trajectories.items():
@@ -125,12 +119,9 @@ def drift_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
 
 
 def scale_figure(trajectories: Mapping[str, Trajectory], is_metric: bool, gaps: Iterable[Stretch]) -> go.Figure:
-    """Lengths over the true ones, and the error of the rotation, over time.
+    """Lengths over the true ones, and the error of the rotation, over time; gaps are shaded.
 
-    Args:
-        trajectories: with the reference.
-        is_metric: lengths of all but the network are then taken as written, else after the 7-dof alignment.
-        gaps: interpolated frames, which are shaded.
+    Where lengths are metric those of all but the network are taken as written, else after the 7-dof alignment.
     """
     figure, reference = _panels("length / true length", "rotation error (deg)"), trajectories[REFERENCE]
     for name, estimate, truth in paired(trajectories):

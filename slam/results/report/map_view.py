@@ -47,9 +47,6 @@ def map_view(folder: RunFolder, triangles: int) -> MapView | None:
     """The map with at most about so many triangles; None without ``map_mesh.ply``, or where none are wanted.
 
     It is seen from that one of nine frames, evenly spread over the path, before which most vertices lie.
-
-    Raises:
-        RunError: the mesh is damaged.
     """
     trajectory = folder.trajectory("optimised")
     if not triangles or trajectory is None or not (folder.path / MAP_MESH).is_file():
@@ -64,11 +61,7 @@ def map_view(folder: RunFolder, triangles: int) -> MapView | None:
 
 
 def thinned_mesh(path: Path, triangles: int) -> MapMesh:
-    """A ``map_mesh.ply`` with at most about so many triangles, by quadric errors; a large one is clustered first.
-
-    Raises:
-        RunError: it is no mesh that can be read.
-    """
+    """A ``map_mesh.ply`` with at most about so many triangles, by quadric errors; a large one is clustered first."""
     mesh = import_open3d().io.read_triangle_mesh(str(path))
     if not mesh.has_triangles():
         raise RunError(f"{path} is no mesh that can be read: run the sequence again")

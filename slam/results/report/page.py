@@ -56,17 +56,10 @@ def write_report(
     view: MapView | None = None,
     metrics: Metrics | None = None,
 ) -> None:
-    """Write ``report.html`` from the files of a folder; also for a failed run.
+    """Write ``report.html`` from the files of a run, also of a failed one, and what they do not hold.
 
-    Args:
-        folder: the run, with its trajectories written.
-        depths: strips of images and their depth.
-        loops: pairs of images of accepted loops.
-        view: of the map, or None without one.
-        metrics: of the run; None reads ``metrics.json``.
-
-    Raises:
-        RunError: a file of the folder is damaged.
+    ``depths`` are strips of images and their depth, ``loops`` pairs of images of accepted loops; without ``metrics``
+    those of the folder are read.
     """
     metrics = metrics or folder.metrics()
     said, errors = verdict(metrics), metrics.evaluated_errors()
@@ -74,7 +67,7 @@ def write_report(
     found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
     drawn = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
     accepted = LoopsFile.read(folder.path / LOOPS).accepted or [] if (folder.path / LOOPS).is_file() else []
-    no_map = metrics.map.absent or ("" if metrics.map.triangles is not None else metrics.map.why("triangles"))
+    no_map = "" if metrics.map.triangles is not None else metrics.map.why("triangles")
     page = _TEMPLATES.get_template("page.html.j2").render(
         script=(files("slam.results.report") / "page.js").read_text("utf-8"),
         plotly=_plotly,

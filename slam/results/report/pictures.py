@@ -47,12 +47,10 @@ class DepthPictures:
 
 
 def loop_pictures(loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics) -> list[Picture]:
-    """Some loops, spread over the drive: both images with lines between the corners that measured the loop.
+    """Some accepted loops, spread over the drive: both images with lines between the corners that measured the loop.
 
-    Args:
-        loops: accepted ones.
-        image: of a frame; None where it is gone, as those of a live drive are. Such loops are left out.
-        intrinsics: of the recording; images may be smaller.
+    Loops of which an image is None, as those of a live drive are, are left out; ``intrinsics`` are of the recording,
+    images may be smaller.
     """
     found = []
     ordered = sorted(loops, key=lambda loop: loop.ends[::-1])

@@ -24,9 +24,6 @@ def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
 
     The world is that of the optimised trajectory, y down. Images, of these ``intrinsics``, and depth, in the unit of
     the trajectory, are those of keyframes, thinned.
-
-    Raises:
-        SlamError: rerun is not installed, or the file cannot be written.
     """
     (rr,) = import_extra("rerun")
     keyframes = {keyframe.index: keyframe for keyframe in result.drive.keyframes}

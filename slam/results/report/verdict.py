@@ -38,7 +38,7 @@ def verdict(metrics: Metrics) -> Verdict | None:
         return None
     scraps = _scraps(metrics)
     said = [*_confidence(metrics), *_loops(metrics), *_agreement(metrics), *_unit(metrics), *_noise(metrics)]
-    said += [*_frames(metrics), *_map(metrics), *([(False, scraps)] if scraps else [])]
+    said += [*_rest(metrics), *([(False, scraps)] if scraps else [])]
     signs, doubts = ([words for is_sign, words in said if is_sign == wanted] for wanted in (True, False))
     return Verdict(_sentence(metrics), signs, doubts, scraps)
 
@@ -118,7 +118,7 @@ def _noise(metrics: Metrics) -> Iterator[tuple[bool, str]]:
         yield how == "holds", f"its stated noise {how}: {numbers}"
 
 
-def _frames(metrics: Metrics) -> Iterator[tuple[bool, str]]:
+def _rest(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     if doubled := sum(each.last - each.first + 1 for each in metrics.sequence.doubled or ()):
         yield False, f"{_count(doubled, 'frame')} repeat the one before while the camera moves"
     if (maps := metrics.tracking.maps or 1) > 1:
@@ -127,11 +127,7 @@ def _frames(metrics: Metrics) -> Iterator[tuple[bool, str]]:
         yield False, f"tracking was lost{f' at frames {lost}' if lost else ''}: {maps} maps are not joined"
     if metrics.provenance.leak is True:
         yield False, "LEAK: its weights saw this sequence, or a part of it, in training"
-
-
-def _map(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    off = metrics.map.accuracy_median_m
-    if off is not None:
+    if (off := metrics.map.accuracy_median_m) is not None:
         yield True, f"its map lies {off:.2g} m (median) from the true surface"
 
 

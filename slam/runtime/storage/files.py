@@ -23,18 +23,6 @@ def write_atomically(
         raise error(str(cause)) from cause
 
 
-def remove(path: Path, error: type[SlamError] = SlamError) -> None:
-    """Remove a file if it is there.
-
-    Raises:
-        SlamError: (or the given kind) it cannot be removed.
-    """
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as cause:
-        raise error(f"{path} cannot be removed: {cause.strerror or cause}") from cause
-
-
 def from_anywhere(name_or_path: str | Path) -> str:
     """A file or folder that is there by its whole path, which holds in any folder; all else as it is."""
     path = Path(name_or_path)

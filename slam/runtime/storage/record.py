@@ -6,7 +6,7 @@ import json
 import math
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Never, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -97,7 +97,7 @@ class Record(BaseModel):
             RunError: damaged, too large, nested without end, or a value of another kind; one line.
         """
         try:
-            content = json.loads(read_text(path), parse_constant=_refused)
+            content = json.loads(read_text(path))
             json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
             return cls.model_validate(content)
         except FileNotFoundError:
@@ -146,7 +146,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(each) for key, each in value.items()}
     return [_plain(each) for each in value] if isinstance(value, list) else value
-
-
-def _refused(word: str) -> Never:
-    raise ValueError(f"{word} is no number of JSON")

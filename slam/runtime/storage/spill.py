@@ -24,11 +24,7 @@ class SpillFile:
         self._lock = Lock()  # the file has one position, which every write and read moves
 
     def put(self, array: NDArray[Any]) -> SpilledArray:
-        """Write an array.
-
-        Raises:
-            SlamError: the disk is full.
-        """
+        """Write an array."""
         content = np.ascontiguousarray(array)
         try:
             with self._lock:
@@ -45,11 +41,7 @@ class SpillFile:
         return SpilledArray(self, start, content.shape, content.dtype)
 
     def read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An array that was put at ``start``.
-
-        Raises:
-            SlamError: the file cannot be read, or was cut short.
-        """
+        """An array that was put at ``start``."""
         count = int(np.prod(shape))
         try:
             with self._lock:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import os
-import threading
 from pathlib import Path
 from threading import Thread
 
@@ -14,30 +12,16 @@ import pytest
 from matplotlib.figure import Figure
 
 from erfsfm.common.errors import BusyError, ConfigError
-from erfsfm.common.files import FIGURE_SUFFIXES, FolderLock, read_bytes, read_text, save_figure, write_atomically
+from erfsfm.common.files import FIGURE_SUFFIXES, FolderLock, read_bytes, save_figure, write_atomically
 
 
-@pytest.mark.parametrize("through", ["itself", "a link"])
-def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path, through: str) -> None:
+def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path) -> None:
     """A superuser's rename would put a file there, also in the place of /dev/null."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    (tmp_path / "link").symlink_to(pipe)
     with pytest.raises(OSError, match="is a device or a pipe: give the name of a file"):
-        write_atomically(pipe if through == "itself" else tmp_path / "link", lambda path: path.write_text("x"))
-    assert pipe.is_fifo() and (tmp_path / "link").is_symlink() and len(list(tmp_path.iterdir())) == 2
-
-
-def test_a_disk_that_is_full_names_the_file(tmp_path: Path) -> None:
-    target = tmp_path / "new" / "depth.png"
-
-    def fill(path: Path) -> None:
-        path.write_text("half")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with pytest.raises(OSError, match=r"depth\.png: cannot be written \(No space left on device\)$"):
-        write_atomically(target, fill)
-    assert list(target.parent.iterdir()) == []
+        write_atomically(pipe, lambda path: path.write_text("x"))
+    assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
@@ -45,15 +29,6 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
         file.truncate(2**40)
     with pytest.raises(OSError, match="larger than 1024 MiB"):
         read_bytes(tmp_path / "sparse", 2**30)
-
-
-def test_a_pipe_is_read(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    writer = threading.Thread(target=lambda: pipe.write_text("a\r\nb"))
-    writer.start()
-    assert read_text(pipe) == "a\nb"
-    writer.join()
 
 
 @pytest.mark.parametrize("suffix", FIGURE_SUFFIXES)
@@ -69,7 +44,9 @@ def test_another_image_stays(tmp_path: Path) -> None:
     image = tmp_path / "000000.png"
     cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
     before = image.read_bytes()
-    with pytest.raises(ConfigError, match=r"000000\.png exists and is no figure of erfsfm: choose another --output"):
+    with pytest.raises(
+        ConfigError, match=r"000000\.png is none of ours and would be replaced: choose another --output"
+    ):
         save_figure(Figure(), image, dpi=50)
     assert image.read_bytes() == before
 
@@ -103,9 +80,3 @@ def test_who_waits_holds_a_folder_after_the_other(tmp_path: Path) -> None:
         events.append("held")
     thread.join(30)
     assert events == ["held", "waited"]
-
-
-def test_where_no_folder_can_be_made_there_is_nothing_to_hold(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with FolderLock() as lock:
-        lock.take(tmp_path / "file" / "run")

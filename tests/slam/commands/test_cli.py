@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 import slam
-import slam.commands.run.run
+import slam.commands.run
 from slam.commands.cli import main
-from slam.commands.run.request import RunRequest
+from slam.commands.run import RunRequest
 from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import read_trajectory
@@ -149,7 +149,7 @@ def test_an_interrupted_run_says_so(call: Call, monkeypatch: pytest.MonkeyPatch)
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(slam.commands.run.run, "perform", interrupt)
+    monkeypatch.setattr(slam.commands.run, "perform", interrupt)
     code, _, err = call("run")
     assert code == 130 and "interrupted; what was written stays" in err
 
@@ -235,8 +235,8 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
     run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
     assert call(*run)[0] == 0
     images = kitti_root / "sequences" / "sim" / "image_2"
-    code, out, err = call("localize", images, "--map", "run")
-    assert (code, err) == (0, "") and "of 14 images found" in out and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
+    code, out, err = call("localize", images, "--map", "run", "--frames", "11:14")
+    assert (code, err) == (0, "") and "of 3 images found" in out and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
     code, out, _ = call("localize", images / "000003.png", "--map", "run", "--json")
     assert code == 0 and [entry["image"] for entry in json.loads(out)] == ["000003.png"]
     assert call("localize", images, "--map", images)[0] == 1
@@ -261,11 +261,7 @@ def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> Non
 
 def test_doctor(call: Call, kitti_root: Path) -> None:
     code, out, _ = call("doctor", "--dataset", kitti_root)
-    assert code == 0
-    assert all(line.split()[0] in ("ok", "missing") for line in out.splitlines())
-    assert "sequence sim: 14 frames" in out
-    assert call("doctor")[0] == 0  # no data set was named
-
+    assert code == 0 and "sequence sim: 14 frames" in out
     code, out, _ = call("doctor", "--dataset", "nowhere")
     assert code == 1 and "nowhere" in out.splitlines()[-1]
     code, out, _ = call("doctor", "--dataset", kitti_root, "--camera", "fov=700")

@@ -27,11 +27,12 @@ from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
 UNIT = 0.5  # lengths of the map per metre
+FRAMES = 45
 
 
 @functools.cache
 def street(seed: int, hazards: tuple[str, ...] = ()) -> SimulatedSequence:
-    return SimulatedSequence(SimulationOptions("straight", 60, seed, 312, 96, hazards))
+    return SimulatedSequence(SimulationOptions("straight", FRAMES, seed, 312, 96, hazards))
 
 
 def reference() -> FloatArray:
@@ -45,7 +46,7 @@ def places() -> Places:
     """Places as a run on every third frame keeps them, with exact depth."""
     sequence = street(630)
     extractor = FeatureExtractor(sequence.intrinsics)
-    frames = range(0, 60, 3)
+    frames = range(0, FRAMES, 3)
     views = []
     for k in frames:
         rendered = sequence.street.render(k)
@@ -84,7 +85,7 @@ def save(path: Path, image: Image) -> None:
 def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
     localiser = Localiser(places())
     found = 0
-    for k in range(4, 58, 6):
+    for k in range(4, FRAMES - 4, 10):
         result = localiser.locate(f"{k}", street(630, hazards).frame(k).image)
         if result.T_world_camera is None:
             continue
@@ -93,7 +94,7 @@ def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple
         away = np.linalg.norm(result.T_world_camera[:3, 3] / UNIT - reference()[k, :3, 3])
         assert away < 0.5 and rotation_angle(T_error[:3, :3]) < np.deg2rad(1.0)
         assert result.nearest_frame is not None and abs(result.nearest_frame - k) <= 2 and result.inliers >= 20
-    assert found >= 7
+    assert found >= 3
 
 
 def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -> None:
@@ -103,7 +104,7 @@ def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -
         for view in places().views
     )
     localiser = Localiser(replace(places(), views=views))
-    for k in (10, 25, 40):
+    for k in (10, 40):
         found = localiser.locate(f"{k}", street(630).frame(k).image).T_world_camera
         assert found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
 
@@ -127,12 +128,8 @@ def bent(image: Image, camera: CameraFile) -> Image:
     return np.asarray(cv2.remap(image, seen.astype(np.float32), None, cv2.INTER_LINEAR), np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("where", "given"), [("images", ("", "images/25.png")), (".", ("images", "images/25.png")), (None, ())]
-)
-def test_images_of_a_lens_need_its_camera_file(
-    run: RunFolder, tmp_path: Path, where: str | None, given: tuple[str, ...]
-) -> None:
+@pytest.mark.parametrize(("where", "given"), [("images", "images/25.png"), (".", "images"), (None, "")])
+def test_images_of_a_lens_need_its_camera_file(run: RunFolder, tmp_path: Path, where: str | None, given: str) -> None:
     """It is looked for where ``run`` looks."""
     run.write(PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write)
     pinhole = places().intrinsics
@@ -145,10 +142,9 @@ def test_images_of_a_lens_need_its_camera_file(
             localise(tmp_path / "album", run)
         return
     (tmp_path / "album" / where / "camera.yaml").write_text(lens.model_dump_json(exclude_none=True))
-    for images in given:
-        (found,) = localise(tmp_path / "album" / images, run)
-        assert found.T_world_camera is not None, found.reason
-        assert np.linalg.norm(found.T_world_camera[:3, 3] / UNIT - reference()[25, :3, 3]) < 0.5
+    (found,) = localise(tmp_path / "album" / given, run)
+    assert found.T_world_camera is not None, found.reason
+    assert np.linalg.norm(found.T_world_camera[:3, 3] / UNIT - reference()[25, :3, 3]) < 0.5
 
 
 def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path) -> None:
@@ -162,7 +158,7 @@ def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, albu
 @pytest.mark.parametrize("what", ["another street", "noise", "black"])
 def test_images_of_other_places_are_refused(what: str) -> None:
     images = {
-        "another street": [street(seed).frame(k).image for seed in (631, 632) for k in range(5, 55, 20)],
+        "another street": [street(seed).frame(k).image for seed, k in ((631, 5), (632, 40))],
         "noise": [np.random.default_rng(0).integers(0, 255, (96, 312, 3), np.uint8)],
         "black": [np.zeros((96, 312, 3), np.uint8)],
     }[what]
@@ -192,7 +188,7 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
     numbered = [replace(each, number=int(Path(each.image).stem)) for each in found]
     write_localisations(tmp_path / "found.kitti", numbered)
-    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(60.0), reference()))
+    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(float(FRAMES)), reference()))
     pair = associate(read_trajectory(tmp_path / "found.kitti"), read_trajectory(tmp_path / "truth.txt"))
     assert [len(each) for each in pair] == [3, 3]
     np.testing.assert_allclose(pair[0].positions / UNIT, pair[1].positions, atol=0.5)

@@ -14,7 +14,7 @@ from slam.runtime.imports import import_open3d
 o3d = import_open3d()
 assert not {"dash", "plotly", "IPython"} & set(sys.modules)
 assert not hasattr(o3d, "nonesuch")
-%s
+from open3d.visualization import rendering
 assert o3d.visualization.draw_geometries and o3d.visualization is sys.modules["open3d.visualization"]
 """
 
@@ -30,15 +30,7 @@ assert import_open3d().visualization.draw_plotly
 """
 
 
-def runs(code: str) -> None:
+@pytest.mark.parametrize("code", [WINDOWS, IN_NOTEBOOK], ids=["windows at their first use", "whole in a notebook"])
+def test_open3d_is_imported(code: str) -> None:
     finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr
-
-
-def test_open3d_is_imported_in_a_notebook() -> None:
-    runs(IN_NOTEBOOK)
-
-
-@pytest.mark.parametrize("use", ["", "import open3d.visualization", "from open3d.visualization import rendering"])
-def test_the_windows_of_open3d_are_imported_at_their_first_use(use: str) -> None:
-    runs(WINDOWS % use)

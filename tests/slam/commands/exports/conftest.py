@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from meshes import coloured_ply
 
-from slam.formats.ply import Ply
+from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
@@ -46,8 +46,6 @@ def make_recorded(tmp_path: Path, make_run: Callable[..., RunFolder], sheet: Ply
     """Builds a run of a folder of images: eight frames, of which ``broken`` cannot be read."""
 
     def make(broken: tuple[int, ...] = (), bridged: tuple[int, ...] = ()) -> RunFolder:
-        from slam.formats.ply import write_ply
-
         images = tmp_path / "drive"
         images.mkdir()
         for k in range(FRAMES):

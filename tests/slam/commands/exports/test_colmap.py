@@ -19,12 +19,12 @@ from slam.runtime.run_files import PLACES
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.street import SimulationOptions
 
-FRAMES, STRIDE = 24, 2
+FRAMES, STRIDE = 18, 2
 
 
 @pytest.fixture(scope="module")
 def street() -> SimulatedSequence:
-    return SimulatedSequence(SimulationOptions("straight", FRAMES, 630, 416, 128))
+    return SimulatedSequence(SimulationOptions("straight", FRAMES, 630, 312, 96))
 
 
 @pytest.fixture

@@ -14,11 +14,14 @@ import pytest
 
 from slam.commands.export import R_UP_WORLDS, export
 from slam.formats.ply import Ply
+from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import invert
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
+from slam.runtime.run_files import PLACES
 from slam.sequences.catalogue import open_sequence
 
 MakeRecorded = Callable[..., RunFolder]
@@ -59,9 +62,6 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     camera_file.write_text(camera_file.read_text() + "model: opencv\ndistortion: [-0.3, 0, 0, 0]\n")
     with pytest.raises(RunError, match="another camera"):
         export(folder, "nerfstudio", tmp_path / "scene")
-    from slam.loops.places import Places
-    from slam.runtime.run_files import PLACES
-
     camera = open_sequence(tmp_path / "drive").intrinsics
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
     content = scene(export(folder, "nerfstudio", tmp_path / "scene"))
@@ -91,8 +91,6 @@ def test_interpolated_frames_are_no_images_of_a_colmap_model(make_recorded: Make
 
 
 def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    from slam.formats.trajectory import Trajectory
-
     folder = make_recorded()
     trajectory = folder.trajectory("optimised")
     assert trajectory is not None
@@ -115,14 +113,8 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     assert "\n" not in str(caught.value) and not (tmp_path / "scene").exists()
     written = export(folder, "nerfstudio", tmp_path / "scene", "z", dataset=tmp_path / "elsewhere")
     assert len(scene(written)["frames"]) == 8
-
-
-def test_another_recording_is_refused(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    from slam.formats.trajectory import Trajectory
-
     trajectory = folder.trajectory("optimised")
     assert trajectory is not None
     folder.write_trajectory("optimised", Trajectory(trajectory.stamps + 100, trajectory.T_world_camera, True))
     with pytest.raises(RunError, match="has no frame at the times of"):
-        export(folder, "nerfstudio", tmp_path / "scene")
+        export(folder, "nerfstudio", tmp_path / "another", dataset=tmp_path / "elsewhere")

@@ -13,7 +13,7 @@ from meshes import coloured_ply
 
 from slam.commands.cli import app
 from slam.commands.export import export
-from slam.commands.occupancy import FREE, OCCUPIED, UNKNOWN, Grid, ground_along, occupancy_grid, samples, write_ros_map
+from slam.commands.occupancy import FREE, OCCUPIED, UNKNOWN, ground_along, occupancy_grid
 from slam.formats.ply import Ply
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -86,8 +86,7 @@ def test_the_ground_follows_slope_and_bank(street: tuple[Ply, FloatArray]) -> No
     assert np.isnan(ground.heights(np.array([[40.0, 10.0]]))).all()
 
 
-@pytest.mark.parametrize("unit", [1.0, 1 / CAMERA_HEIGHT])
-@pytest.mark.parametrize("resolution", [0.1, 0.25])
+@pytest.mark.parametrize(("resolution", "unit"), [(0.1, 1.0), (0.25, 1 / CAMERA_HEIGHT)])
 def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resolution: float, unit: float) -> None:
     mesh, poses = street
     vertices = mesh.vertices.copy()
@@ -95,8 +94,8 @@ def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resol
         vertices[axis] *= unit
     poses = poses.copy()
     poses[:, :3, 3] *= unit
-    values, grid = occupancy_grid(Ply(vertices, mesh.triangles), poses, resolution * unit, unit == 1.0)
-    shape, corner, step = grid.shape, np.array([grid.x_min, grid.y_min]) / unit, grid.resolution / unit
+    values, corner = occupancy_grid(Ply(vertices, mesh.triangles), poses, resolution * unit, unit == 1.0)
+    shape, corner, step = values.shape, corner / unit, resolution
 
     def cells(x: tuple[float, float], y: tuple[float, float]) -> np.ndarray:
         first, last = (int((value - corner[0]) / step) for value in x)
@@ -115,15 +114,11 @@ def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resol
 def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(street: tuple[Ply, FloatArray]) -> None:
     _, poses = street
     parts = [level((-3, 3.2), along, 0.0) for along in ((-1, 10), (10.2, 20), (21.5, 60))]
-    values, grid = occupancy_grid(together(*parts), poses, 0.1, True)
+    values, _ = occupancy_grid(together(*parts), poses, 0.1, True)
     # the last rows of the parts lie at 9.8, 19.8 and 59.8
-    of_y = {y: values[grid.height - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)}
-    assert {y: set(row.tolist()) for y, row in of_y.items()} == {
-        9.9: {FREE},
-        10.1: {FREE},
-        20.6: {UNKNOWN},
-        30.0: {FREE},
-    }
+    of_y = {y: values[len(values) - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)}
+    expected = {9.9: {FREE}, 10.1: {FREE}, 20.6: {UNKNOWN}, 30.0: {FREE}}
+    assert {y: set(row.tolist()) for y, row in of_y.items()} == expected
 
 
 def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None:
@@ -132,42 +127,29 @@ def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None
         occupancy_grid(level((-3, 3), (0, 50), 5.0), poses, 0.2, True)
 
 
-def test_large_triangles_leave_no_holes_and_keep_their_area() -> None:
-    corners = np.array([[-5, 0, -1.5], [5, 0, -1.5], [5, 20, -1.5], [-5, 20, -1.5]], float)
+def test_large_triangles_leave_no_holes(street: tuple[Ply, FloatArray]) -> None:
+    """Two triangles from 20 m on; before them a vertex every 0.2 m, by which the ground is known."""
+    corners = np.array([[-5, 20, 0], [5, 20, 0], [5, 60, 0], [-5, 60, 0]], float)
+    corners[:, 2] = -CAMERA_HEIGHT
     floor = coloured_ply(corners, np.zeros((4, 3)), np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]]))
-    grid = Grid.around(floor.points, 0.07)
-    area, seen = 0.0, np.zeros(grid.width * grid.height, bool)
-    for points, areas in samples(floor, 0.07):
-        area += areas.sum()
-        seen[grid.cells(points)] = True
-    assert area == pytest.approx(200) and seen.mean() > 0.985  # the border cells are cut by the edge
-
-
-def test_files_are_those_of_the_map_server(tmp_path: Path) -> None:
-    cells = np.full((5, 4), UNKNOWN, np.uint8)
-    cells[0, 3], cells[4, 0] = OCCUPIED, FREE
-    write_ros_map(tmp_path / "a: map.yaml", cells, (-1.5, 2.25), 0.05, "metres")
-    described = yaml.safe_load((tmp_path / "a: map.yaml").read_text())
-    assert described == {
-        "image": "a: map.pgm",
-        "resolution": 0.05,
-        "origin": [-1.5, 2.25, 0.0],
-        "negate": 0,
-        "occupied_thresh": 0.65,
-        "free_thresh": 0.196,
-    }
-    image = cv2.imread(str(tmp_path / described["image"]), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(image, cells)
-    occupied = (255 - image.astype(float)) / 255  # as map_server reads a pixel
-    assert (occupied > described["occupied_thresh"]).sum() == 1 and (occupied < described["free_thresh"]).sum() == 1
+    near = level((-5, 5.2), (-1, 20.2), 0.0)
+    near.vertices["z"][:] = -CAMERA_HEIGHT
+    poses = street[1].copy()
+    poses[:, 2, 3] = 0.0
+    values, _ = occupancy_grid(together(near, floor), poses, 0.07, True)
+    rows = int(20 / 0.07)  # the ground is told as far as 12 camera heights from the last vertex
+    assert (values[-(rows + 150) : -rows] == FREE).mean() > 0.985  # the border cells are cut by the edge
 
 
 @pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
 def test_the_grid_of_a_run(make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str) -> None:
     written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", resolution=0.2)
     assert sorted(path.name for path in written.parent.iterdir()) == ["map.pgm", "map.yaml"]
-    assert written.name == "map.yaml" and yaml.safe_load(written.read_text())["origin"] == [0.0, 2.0, 0.0]
-    cells = cv2.imread(str(tmp_path / "new" / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    described = yaml.safe_load(written.read_text())
+    as_map_server = {"occupied_thresh": 0.65, "free_thresh": 0.196, "negate": 0}
+    place = {"image": "map.pgm", "resolution": 0.2, "origin": [0.0, 2.0, 0.0]}
+    assert written.name == "map.yaml" and described == place | as_map_server
+    cells = cv2.imread(str(written.with_name(described["image"])), cv2.IMREAD_UNCHANGED)
     assert cells.shape == (15, 10) and (cells == FREE).mean() > 0.9
 
 

@@ -74,7 +74,7 @@ class Recorder:
 
 def test_everything_is_logged(quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = Recorder()
-    for module in ("slam.commands.run.run", "slam.results.report.rerun"):
+    for module in ("slam.commands.run", "slam.results.report.rerun"):
         monkeypatch.setattr(f"{module}.import_extra", lambda extra: (recorder,))
     run_slam(**quick, rerun=tmp_path / "deep" / "run.rrd")
     assert (tmp_path / "deep" / "run.rrd").read_bytes() == b"RRF2"

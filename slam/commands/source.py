@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,29 +36,13 @@ _WRITING_S = 1.0  # that an image may take to be written
 logger = logging.getLogger(__name__)
 
 
-class Source(Protocol):
-    """Images as they come, each with its stamp in seconds; ``is_stored`` where they wait to be read."""
-
-    width: int
-    height: int
-    fps: float
-    is_stored: bool
-
-    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
-        """All images until the source ends or ``stopped`` is set; ``SequenceError`` where it dies."""
-
-
 class FolderSource:
     """A folder that another program fills; image ``k`` in natural order was taken at ``k / fps``."""
 
     is_stored = True
 
     def __init__(self, folder: Path, wait_s: float) -> None:
-        """Wait up to ``wait_s`` for the first image that can be read; it gives the size.
-
-        Raises:
-            SequenceError: none came.
-        """
+        """Wait up to ``wait_s`` for the first image that can be read; it gives the size."""
         self._folder, self.fps = folder, DEFAULT_FPS
         self._past: set[str] = set()
         self._stretch: Stretch | None = None
@@ -120,12 +105,10 @@ class FolderSource:
 
     def _first_size(self) -> tuple[int, int] | None:
         """Height and width of the first image that can be read; None while there is none."""
-        try:
+        with suppress(DataError):  # it is still being written
             if waiting := self._waiting():
                 self._stretch = stretch_of(waiting, read_values)
                 return first_size(waiting)
-        except DataError:
-            pass  # it is still being written
         return None
 
 
@@ -133,11 +116,7 @@ class VideoSource:
     """A source that OpenCV opens: a camera's number, a stream's address, or a file, played at its own speed."""
 
     def __init__(self, name: str, wait_s: float) -> None:
-        """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off.
-
-        Raises:
-            SequenceError: it cannot be opened or gives no image.
-        """
+        """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off."""
         self._name, self._wait_s = name, wait_s
         self.is_stored = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
         if Path(name).is_fifo():  # OpenCV would wait for ever
@@ -179,11 +158,11 @@ class VideoSource:
         return np.ascontiguousarray(image[..., ::-1]) if read and image is not None else None
 
 
-def open_source(camera: str, wait_s: float) -> Source:
-    """A source by what the user named; its ``fps``, of files, may be set before the first image.
+Source = FolderSource | VideoSource
+"""Images as they come, each with its stamp in seconds; ``is_stored`` where they wait to be read."""
 
-    Raises:
-        SequenceError: it cannot be opened, or no image comes within ``wait_s``.
-    """
+
+def open_source(camera: str, wait_s: float) -> Source:
+    """A source by what the user named; its ``fps``, of files, may be set before the first image."""
     folder = Path(camera)
     return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera, wait_s)

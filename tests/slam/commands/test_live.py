@@ -23,8 +23,8 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live.run import LiveRequest, StreamedSequence, run_live
-from slam.commands.live.source import FolderSource, VideoSource, open_source
+from slam.commands.live import LiveRequest, StreamedSequence, run_live
+from slam.commands.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
 from slam.sequences.camera_file import explicit_camera

@@ -16,10 +16,8 @@ import numpy as np
 from erfsfm.common.files import FolderLock
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.signals import raising_on_termination
-from slam.commands.live.source import Source, open_source
-from slam.commands.run.recorder import FolderRecorder
-from slam.commands.run.request import Request
-from slam.commands.run.run import provenance_of, record
+from slam.commands.run import FolderRecorder, Request, provenance_of, record
+from slam.commands.source import Source, open_source
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics
@@ -62,14 +60,7 @@ class LiveRequest(Request):
 def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
     """Track a stream until it ends, stalls, dies or is interrupted, then leave a whole run.
 
-    The first ctrl-C, SIGTERM or SIGHUP ends the stream, another one the run.
-
-    Args:
-        request: all inputs.
-        emit: called with every message.
-
-    Raises:
-        SlamError, ErfsfmError: one line; as ``slam.commands.run.run.run_slam``.
+    Every message goes to ``emit``. The first ctrl-C, SIGTERM or SIGHUP ends the stream, another one the run.
     """
     with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
         if request.output is not None:
@@ -118,17 +109,9 @@ class StreamedSequence(GrowingSequence):
     def __init__(
         self, name: str, source: Source, camera: CameraFile, most_wait_s: float, every_frame: bool = False
     ) -> None:
-        """Prepare to read; the thread begins with the first frame.
+        """``source`` is read from the first frame on until it sends nothing for ``most_wait_s``.
 
-        Args:
-            name: of the sequence.
-            source: is read until it sends nothing for ``most_wait_s``.
-            camera: its calibration; images are undistorted.
-            most_wait_s: seconds.
-            every_frame: the source waits until each image was taken.
-
-        Raises:
-            SequenceError: every frame is wanted of a source that does not wait, or the camera has another image size.
+        With ``every_frame`` it waits until each image was taken.
         """
         require_size(source, camera, name)
         if every_frame and not source.is_stored:
@@ -212,7 +195,10 @@ class LiveRecorder(FolderRecorder):
         sequence = self._sequence
         if not sequence.waiting:
             observer.flush()
-        self._say_dropped()
+        dropped, now_s = sequence.dropped, time.monotonic()
+        if dropped > self._dropped and now_s - self._dropped_said_s >= 1.0:  # once a second
+            self._dropped, self._dropped_said_s = dropped, now_s
+            logger.warning("%d images dropped, %d measured", dropped, len(sequence))
         for newest in self._poses.add(observer):
             index, self._said = self._said, self._said + 1
             at_s = sequence.arrived_s.get(index)
@@ -247,13 +233,6 @@ class LiveRecorder(FolderRecorder):
             T_world_camera = self._poses.T_world_camera
             stamps = self._sequence.stamps[: len(T_world_camera)]
             self.folder.write_trajectory("odometry", Trajectory(stamps, T_world_camera))
-
-    def _say_dropped(self) -> None:
-        """Once a second, while more images are dropped."""
-        dropped, now_s = self._sequence.dropped, time.monotonic()
-        if dropped > self._dropped and now_s - self._dropped_said_s >= 1.0:
-            self._dropped, self._dropped_said_s = dropped, now_s
-            logger.warning("%d images dropped, %d measured", dropped, len(self._sequence))
 
 
 class Viewer:

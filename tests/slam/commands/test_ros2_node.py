@@ -25,7 +25,7 @@ pytest.importorskip("rosbags")
 
 from rosbags.typesys import Stores, get_typestore
 
-NODE = Path(__file__).parents[4] / "tools" / "ros2" / "slam_node.py"
+NODE = Path(__file__).parents[3] / "tools" / "ros2" / "slam_node.py"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 FRAMES, FIRST_S = 12, 1_700_000_000
 MESSAGES = {
@@ -279,7 +279,7 @@ def test_an_occupancy_grid_follows_its_keyframes(node_module: ModuleType) -> Non
         T_map_camera[1, 0, 3] = 1.0 + moved
         cells, grid = live_map.grid(T_map_camera, 1.65, 1.0)
         row = cells[cells.shape[0] // 2]
-        walls = {float(grid.x_min + 0.5 * k): int(row[k]) for k in np.flatnonzero(row > 0)}
+        walls = {float(grid.corner[0] + 0.5 * k): int(row[k]) for k in np.flatnonzero(row > 0)}
         assert walls == ({6.0: 100, 27.0: 100} if moved else {6.0: 50, 7.0: 100}), "the second sees road at 6 m"
         assert (row == 0).sum() >= 8 and len(live_map.points(T_map_camera)) > 100
 

@@ -1,1 +1,0 @@
-"""The system while frames arrive: a camera, a stream or a folder being filled."""

@@ -1,0 +1,332 @@
+"""One run from start to end: what ``run`` and `slam.run_slam` are given in, a run folder out."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field, ValidationError
+
+from erfsfm import __version__
+from erfsfm.common.config_tree import Section, first_problem
+from erfsfm.common.errors import explained
+from erfsfm.common.files import FolderLock
+from erfsfm.common.progress import Progress, progress_bar, progress_lines, silent
+from erfsfm.common.signals import raising_on_termination
+from erfsfm.common.threads import limit_library_threads
+from erfsfm.inference import commit
+from slam.config.sections import SlamConfig, dump_yaml, load_config
+from slam.evaluation.map import double_wall_share
+from slam.formats.ply import Ply
+from slam.formats.trajectory import Trajectory
+from slam.frames import Frame, Image
+from slam.frames import Sequence as FrameSequence
+from slam.mapping.filters import KeyframeDepth
+from slam.mapping.surface import MapSurface
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.run import Recorder, SlamPipeline
+from slam.prediction.assembly import Prediction, open_prediction
+from slam.prediction.depth_folder import FrameNumbers
+from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
+from slam.results.folder import RunFolder, check_output
+from slam.results.metrics import MapMetrics, Metrics, Provenance
+from slam.results.report.map_view import map_view
+from slam.results.report.page import Picture, write_report
+from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.report.rerun import write_rerun
+from slam.results.run_log import RunLog, run_log
+from slam.results.truth import DepthQuality, map_errors
+from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
+from slam.runtime.imports import import_extra
+from slam.runtime.run_files import CONFIG, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
+from slam.runtime.storage.files import from_anywhere
+from slam.sequences.catalogue import open_sequence
+from slam.sequences.gps import read_gps
+
+logger = logging.getLogger(__name__)
+
+NameOrPath = Annotated[str, BeforeValidator(lambda given: str(given) if isinstance(given, Path) else given)]
+
+_BEGUN = "the run has not ended, or was killed before its trajectories were written"
+_NO_KEYFRAMES = "no frame for the map has depth"
+_RECORDING = ("dataset", "camera", "gps", "sequence", "frames", "truth")
+
+
+class Request(Section):
+    """The inputs that every run has, as ``erfsfm-slam run --help`` explains them; from Python, a path may be text."""
+
+    camera: Path | None = None
+    weights: NameOrPath = "default"
+    config: NameOrPath | None = None
+    overrides: list[str] | None = None
+    output: Path | None = None
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    command: str = "slam.run_slam"  # recorded in the metrics
+
+    @classmethod
+    def of(cls, **arguments: Any) -> Self:
+        """The request of arguments given by name.
+
+        Raises:
+            TypeError: an unknown argument.
+            RunError: a value of another kind.
+        """
+        if unknown := arguments.keys() - cls.model_fields.keys():
+            names = ", ".join(name for name in cls.model_fields if name != "command")
+            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}; it has {names}")
+        try:
+            return cls(**arguments)
+        except ValidationError as error:
+            raise RunError(f"run_slam: {first_problem(error)}") from error
+
+    @property
+    def recording(self) -> dict[str, str]:
+        """The options that name the recording, files by their whole paths; none of the embedded street."""
+        given = {name: getattr(self, name, None) for name in _RECORDING}
+        named = {name: value for name, value in given.items() if value is not None}
+        return {name: from_anywhere(v) if name == "dataset" or isinstance(v, Path) else v for name, v in named.items()}
+
+
+class RunRequest(Request):
+    """Also the recording and what is written of it; without ``dataset`` and ``sequence`` the embedded street."""
+
+    dataset: Path | None = None
+    sequence: str | None = None
+    frames: str | None = None
+    truth: Path | None = None
+    rerun: Path | None = None
+    gps: Path | None = None
+    progress: Progress = silent  # called with (stage, done, total)
+
+
+class FolderRecorder(Recorder):
+    """Writes results to a folder as they come, and ``metrics.json`` at the begin, with the estimate, and at the end."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        pipeline: SlamPipeline,
+        settings: SlamConfig,
+        provenance: Provenance,
+        progress: Progress = silent,
+    ) -> None:
+        """Prepare to write what a pipeline gives."""
+        self.folder, self.pipeline = folder, pipeline
+        self._settings, self._provenance, self._progress = settings, provenance, progress
+        self._metrics = Metrics(schema_=1, status="running", reason=_BEGUN, provenance=provenance)
+
+    def begin(self) -> None:
+        """The metrics and settings of a run that begins; the source of depth by its whole path."""
+        self.folder.write_metrics(self._metrics)
+        settings, (kind, colon, path) = self._settings, self._settings.depth.source.partition(":")
+        if colon:
+            depth = settings.depth.model_copy(update={"source": f"{kind}:{from_anywhere(path)}"})
+            settings = settings.model_copy(update={"depth": depth})
+        self.folder.write_text(CONFIG, dump_yaml(settings))
+
+    def trajectory(self, name: str, trajectory: Trajectory) -> None:
+        """On disk in both formats."""
+        self.folder.write_trajectory(name, trajectory)
+
+    def estimate(self, estimate: Estimate) -> None:
+        """Trajectories by loops and graph, these, and places; all metrics but those of the map."""
+        folder, sequence = self.folder, self.pipeline.sequence
+        for name in ("odometry", "optimised"):
+            folder.write_trajectory(name, getattr(estimate, name))
+        lidar = lidar_trajectory(estimate)
+        if lidar is not None:
+            folder.write_trajectory("lidar", lidar)
+        if not isinstance(estimate.graph, Failed):
+            estimate.graph.write_g2o(folder.path / GRAPH)
+        folder.write_text(LOOPS, json.dumps(estimate.loops.details(), indent=2, allow_nan=False))
+        folder.write(PLACES, estimate.places(sequence.intrinsics).write)
+        with estimate.stopwatch.stage("evaluation"):
+            self._metrics = estimate_metrics(estimate, sequence, self._provenance, self._settings.gps.factors)
+        folder.write_metrics(self._metrics)
+        self._stopwatch = estimate.stopwatch
+        self._quality = DepthQuality(sequence, estimate.scale.is_metric)
+        self._depths = DepthPictures(len(sequence))
+
+    def keyframe(self, keyframe: KeyframeDepth) -> None:
+        """Compared with the truth, and drawn for the report."""
+        self._depths.add(keyframe)
+        with self._stopwatch.stage("evaluation"):
+            self._quality.add(keyframe)
+
+    def map(self, estimate: Estimate | Failed) -> None:
+        """Merge the submaps, write mesh and cloud; without a map its metrics are the reason."""
+        surface = self._surface(estimate)
+        if isinstance(surface, Failed):
+            self._metrics = self._metrics.changed(map=MapMetrics.unknown(surface.reason))
+            return
+        assert isinstance(estimate, Estimate) and estimate.map is not None
+        self._progress("map files", 0, 1)
+        with self._stopwatch.stage("mesh"):
+            surface.write_mesh(self.folder.path / MAP_MESH)
+            surface.write_cloud(self.folder.path / MAP_CLOUD)
+        with self._stopwatch.stage("evaluation"):
+            metric = estimate.scale.is_metric
+            share = double_wall_share(surface.meshes()) if metric else Failed("lengths are not in metres")
+            pieces = lambda: (Ply(piece).points for piece in surface.cloud_pieces())  # noqa: E731
+            errors = map_errors(pieces, estimate, self.pipeline.sequence)
+        self._progress("map files", 1, 1)
+        sizes = estimate.map.statistics()
+        found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
+        self._metrics = self._metrics.changed(map=found)
+
+    def _surface(self, estimate: Estimate | Failed) -> MapSurface | Failed:
+        """The surface of the map, or why there is none."""
+        if isinstance(estimate, Failed):
+            return estimate
+        if estimate.map is None:
+            is_enabled = self._settings.mapping.enabled
+            return Failed(_NO_KEYFRAMES if is_enabled else "fusion is switched off (mapping.enabled)")
+        try:
+            with self._stopwatch.stage("mesh"):
+                return estimate.map.surface(self._progress)
+        except EmptyMapError as error:
+            logger.warning("no map: %s", error)
+            return Failed(str(error))
+
+    def finish(self, estimate: Estimate) -> None:
+        """The report and all metrics of a whole run."""
+        sequence, output = self.pipeline.sequence, self._settings.output
+        depth = self._quality.metrics(self._settings.depth.refine != "none")
+        timing = timing_of(self._stopwatch, len(sequence))
+        metrics = self._metrics.changed(status="ok", reason=None, timing=timing, depth=depth)
+
+        def reported() -> None:
+            if output.report:
+                view = map_view(self.folder, output.viewer_triangles)
+                write_report(self.folder, self._depths.pictures(), self._loop_pictures(estimate), view, metrics)
+
+        self._progress("report", 0, 1)
+        attempt("the report", reported)
+        self.folder.write_metrics(metrics)
+        self._progress("report", 1, 1)
+
+    def fail(self, error: BaseException) -> str:
+        """Write the reason of a failure, which is returned; errors of writing are ignored, for the first is raised."""
+        reason = explained(error) if isinstance(error, Exception) else str(error) or type(error).__name__
+        with suppress(SlamError, OSError):
+            self.folder.write_metrics(self._metrics.changed(status="failed", reason=reason))
+            self.leave()
+            if self._settings.output.report:
+                write_report(self.folder)
+        return reason
+
+    def leave(self) -> None:
+        """What a run that failed can give yet."""
+
+    def _loop_pictures(self, estimate: Estimate) -> list[Picture]:
+        """Images of accepted loops: of the recording, or of the keyframes of a live drive."""
+        sequence = self.pipeline.sequence
+
+        def image(index: int) -> Image | None:
+            try:
+                return sequence.frame(index).image
+            except SlamError:
+                return next((each.image for each in estimate.drive.keyframes if each.index == index), None)
+
+        return loop_pictures(estimate.loops.accepted, image, sequence.intrinsics)
+
+
+def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **options: Any) -> RunFolder:
+    """Run the whole system on one sequence.
+
+    Without ``progress``, the log says every ten seconds (level INFO) what is done; in a notebook its cell does.
+
+    The arguments are those of `RunRequest`, by name; the run folder is returned.
+
+    Raises:
+        TypeError: an unknown argument.
+        SlamError, ErfsfmError: as `perform`.
+    """
+    if options.get("progress") is not None:
+        return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options))
+    in_notebook = "ipykernel" in sys.modules
+    with progress_bar() if in_notebook else progress_lines(logger.info) as progress:
+        return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options | {"progress": progress}))
+
+
+def perform(request: RunRequest) -> RunFolder:
+    """Run the whole system on one sequence.
+
+    All checks come before a folder is made; an earlier run in ``output`` is removed then. The first signal to end
+    during the pass over the frames ends the pass: what was seen is a whole run.
+
+    Raises:
+        SlamError, ErfsfmError: one line. However a run ends, its folder keeps its results and the reason.
+    """
+    with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
+        if request.output is not None:
+            check_output(request.output)
+        if request.rerun is not None:
+            import_extra("rerun")
+        settings = load_config(request.config, request.overrides or ())
+        recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
+        lens, camera = recording.undistortion, recording.intrinsics
+        numbers = FrameNumbers(len(recording), recording.start, recording.recorded)  # by which files of depth are found
+        undistort = None if lens is None else lens.apply_to_depth
+        prediction = open_prediction(request.weights, request.device, settings.depth, camera, numbers, undistort)
+        track = None if request.gps is None else read_gps(request.gps)
+        progress = request.progress
+        pipeline = SlamPipeline(recording, prediction.predictor, settings, progress, request.seed, track)
+        pipeline.require_possible()
+        folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
+        recorder = FolderRecorder(folder, pipeline, settings, provenance_of(request, prediction, recording), progress)
+        estimate = record(recorder, log, ignore_signals)
+        if request.rerun is not None:
+            write_rerun(request.rerun, estimate, pipeline.sequence.intrinsics)
+    return folder
+
+
+def record(
+    recorder: FolderRecorder,
+    log: RunLog,
+    ignore_signals: Callable[[], None],
+    frames: Iterator[Frame] | None = None,
+    interrupt: Callable[[], None] | None = None,
+) -> Estimate:
+    """Run to the end; however that is, the folder keeps the results and the reason.
+
+    The first signal to end during the pass over the frames calls ``interrupt``, by default that of the pipeline.
+    """
+    try:
+        recorder.begin()
+        log.begin(recorder.folder.path / LOG)
+        with limit_library_threads():
+            estimate = recorder.pipeline.run(recorder, frames, interrupt)
+        recorder.finish(estimate)
+        return estimate
+    except BaseException as error:
+        ignore_signals()
+        log.failed(recorder.fail(error))
+        raise
+
+
+def provenance_of(request: Request, prediction: Prediction, recording: FrameSequence) -> Provenance:
+    """The input of a run: networks, depth, and the options that name the recording."""
+    networks, source = prediction.networks, prediction.source
+    is_folder = Path(request.weights) == Path(networks.origin)  # else a shipped name, whatever lies here
+    return Provenance(
+        version=__version__,
+        commit=commit(),
+        command=request.command,
+        seed=request.seed,
+        device=str(networks.device),
+        weights=from_anywhere(request.weights) if is_folder else request.weights,
+        weights_sha256=networks.sha256,
+        weights_licence=networks.record.licence,
+        trained_on=networks.record.trained_on,
+        leak=bool(networks.leaks(recording.provenance())),
+        depth_source="network" if source is None else source.name,
+        depth_sha256=networks.sha256 if source is None else source.sha256,
+        recording=request.recording,
+    )

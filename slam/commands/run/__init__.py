@@ -1,1 +1,0 @@
-"""One run, from its arguments to the whole run folder."""

@@ -25,6 +25,7 @@ PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md",
 LINKED = PAGES | {path: path.read_text() for path in (ROOT / "CHANGELOG.md", *ROOT.glob("erfsfm/weights/*/README.md"))}
 PROGRAMS = {"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.commands.cli.app}
 LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(?:#([^)\s]*))?\)")
+KINDS = ("slam", "erfsfm", "tools", "tests", "configs")
 FILE = re.compile(r"(?<![\w./-])(?:slam|erfsfm|tools|tests|configs|docs)/[\w./-]*\.(?:py|yaml|md)\b")
 KEYS = {
     f"{section}.{key}"
@@ -54,8 +55,11 @@ def test_links_lead_to_pages_and_headings() -> None:
 
 def test_files_and_configuration_keys_that_are_named_exist() -> None:
     strange = []
+    paths = [f"/{path.relative_to(ROOT).as_posix()}" for kind in KINDS for path in (ROOT / kind).rglob("*.py")]
     for page, text in PAGES.items():
         strange += [f"{page.name}: {name}" for name in FILE.findall(text) if not (ROOT / name).exists()]
+        modules = re.findall(r"`([a-z_0-9/]+\.py)`", text)
+        strange += [f"{page.name}: {name}" for name in modules if not any(f"/{name}" in path for path in paths)]
         named = {key for part in re.findall(r"`[^`]+`|--set \S+", text) for key in KEY.findall(part)}
         strange += [f"{page.name}: {key}" for key in named - KEYS]
     assert not strange
@@ -63,7 +67,7 @@ def test_files_and_configuration_keys_that_are_named_exist() -> None:
 
 def test_pages_that_code_names_exist() -> None:
     missing = []
-    for path in (each for kind in ("slam", "erfsfm", "tools", "tests", "configs") for each in (ROOT / kind).rglob("*")):
+    for path in (each for kind in KINDS for each in (ROOT / kind).rglob("*")):
         if path.suffix in {".py", ".yaml", ".md", ".j2"}:
             named = re.findall(r"\bdocs/[\w/-]+\.md\b", path.read_text(encoding="utf-8"))
             missing += [f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).is_file()]

@@ -61,6 +61,7 @@ STEP_CORNERS = Texture(quality=0.008, spacing_px=11.0, block_px=5)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
+_ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
 ROTATION_BASELINE = 2  # steps between frames whose rotation is also measured directly: halves its error
 FEW_CORNERS = 60  # tracks below which they are sought again, with the wide window and equal exposure
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
@@ -204,19 +205,23 @@ class CornerTracker:
         return Tracks(before, now, track_ids[kept], len(kept))
 
     def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
-        """Prepare to track corners of ``previous`` to a frame some steps later.
+        """Prepare to track corners of ``previous`` to a frame some steps later, to which they came step by step.
 
-        The function returned does it, in any thread.
+        The function returned does it, in any thread. It keeps corners that both ways find at the same place, which is
+        half the work of tracking them back.
         """
-        corners = self._corners.get(previous.index)
-        following = min((index for index in self._corners if index > previous.index), default=None)
-        if corners is None or following is None:
-            return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), 0)
-        tracked = np.isin(corners[1], self._corners[following][1])
-        points, track_ids = corners[0][tracked], corners[1][tracked]
+        nothing: tuple[Pixels, NDArray[np.int64]] = np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
+        corners, arrived = (self._corners.get(frame.index, nothing) for frame in (previous, current))
+        track_ids, rows, rows_arrived = np.intersect1d(corners[1], arrived[1], return_indices=True)
+        points, by_steps = corners[0][rows], arrived[0][rows_arrived]
 
         def find() -> Tracks:
-            pixels, kept = _by_first_flow(previous.grey, current.grey, points, [predicted_flow])
+            if not len(points):
+                return Tracks(np.zeros((0, 2)), np.zeros((0, 2)), track_ids, 0)
+            images = previous.grey, predicted_flow.warp_back(current.grey)
+            pixels, kept = _lucas_kanade(*images, points, points, OF_STEPS.side, _PREDICTED_LEVELS, OF_STEPS.limits)
+            pixels = predicted_flow.in_current(pixels)
+            kept &= np.linalg.norm(pixels - by_steps, OF_STEPS.norm, axis=1) < _ACROSS_PX
             before, now = points[kept].astype(np.float64), pixels[kept].astype(np.float64)
             return Tracks(before, now, track_ids[kept], len(kept))
 

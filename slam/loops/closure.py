@@ -15,7 +15,7 @@ from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray
 from slam.loops.consistency import Track, agreeing
-from slam.loops.retrieval import Apart, find_candidates
+from slam.loops.retrieval import Apart, Candidate, find_candidates
 from slam.loops.verification import OF_FRAMES, Loop, LoopVerifier, RejectedLoop
 
 logger = logging.getLogger(__name__)
@@ -25,6 +25,7 @@ MOST_REJECTED = 200
 _LEAST_PATH_M = 15.0
 _LEAST_PATH_OVER_DEPTH = 0.75
 _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
+_TRIED_FIRST = 4  # candidates of a view of which one must be verified before the others are tried
 _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 
 
@@ -96,13 +97,19 @@ def find_loops(views: Sequence[View], track: Track, apart: Apart, verifier: Loop
     The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says
     which may make a loop, see `find_candidates`.
     """
+
+    def verdicts(candidates: Iterable[Candidate]) -> list[Loop | RejectedLoop]:
+        return side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), list(candidates))
+
     candidates = find_candidates(views, apart, verifier.thresholds)
-    verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
-    verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
+    tried = verdicts(c for c in candidates if c.rank < _TRIED_FIRST)
+    seen_again = {verdict.ends[1] for verdict in tried if isinstance(verdict, Loop)}
+    tried += verdicts(c for c in candidates if c.rank >= _TRIED_FIRST and views[c.later].index in seen_again)
+    verified = [verdict for verdict in tried if isinstance(verdict, Loop)]
     accepted, rejected = agreeing(verified, track, verifier.thresholds)
-    rejected += [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
-    logger.info("loops: %d candidates, %d verified, %d accepted", len(candidates), len(verified), len(accepted))
-    return LoopClosures(len(candidates), len(verified), tuple(accepted), most_inliers_first(rejected))
+    rejected += [verdict for verdict in tried if isinstance(verdict, RejectedLoop)]
+    logger.info("loops: %d candidates, %d verified, %d accepted", len(tried), len(verified), len(accepted))
+    return LoopClosures(len(tried), len(verified), tuple(accepted), most_inliers_first(rejected))
 
 
 def most_inliers_first(loops: Iterable[RejectedLoop]) -> tuple[RejectedLoop, ...]:

@@ -28,11 +28,15 @@ Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 
 
 class Candidate(NamedTuple):
-    """Two similar views by their rows; ``score`` is their similarity over that of neighbouring frames."""
+    """Two similar views by their rows; ``score`` is their similarity over that of neighbouring frames.
+
+    ``rank`` counts from the best candidate of the later view, which is 0.
+    """
 
     earlier: int
     later: int
     score: float
+    rank: int
 
 
 def find_candidates(views: Sequence[View], apart: Apart, thresholds: LoopThresholds) -> list[Candidate]:
@@ -52,7 +56,8 @@ def find_candidates(views: Sequence[View], apart: Apart, thresholds: LoopThresho
         scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
         scores[~apart(block) | (rows >= block[:, None])] = 0.0
         for later, row in zip(block, scores, strict=True):
-            candidates += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices, thresholds)]
+            peaks = enumerate(_peaks(row, indices, thresholds))
+            candidates += [Candidate(k, int(later), float(row[k]), rank) for rank, k in peaks]
     return candidates
 
 

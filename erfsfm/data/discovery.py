@@ -37,7 +37,11 @@ Number = TypeVar("Number", int, str)
 
 
 def discover(root: Path) -> list[Recording]:
-    """All recordings under a root, two folders deep, sorted by name; ``DataError`` where there is none."""
+    """All recordings under a root, two folders deep, sorted by name; ``DataError`` where there is none.
+
+    Raises:
+        DataError: no recording found.
+    """
     if not root.exists():
         raise DataError(f"no data set at {root}: the path does not exist")
     found = _recordings_at(root)

@@ -62,6 +62,9 @@ def depth_errors(
 
     Returns:
         The errors, or None where no pixel has truth.
+
+    Raises:
+        ValueError: the maps differ in size.
     """
     if predicted.shape != true_depth.shape:
         raise ValueError(f"predicted depth must have the truth's shape {true_depth.shape}; got {predicted.shape}")

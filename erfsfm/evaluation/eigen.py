@@ -75,6 +75,9 @@ def eigen_protocol(
     Returns:
         Rows ``gt-median`` and ``pose`` of the networks; ``pose`` multiplies depth by the mean over a window's sources
         of true over predicted distance. Then ``gt-median`` of a baseline that uses no image: a flat road, cut at 20 m.
+
+    Raises:
+        DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
     """
     frames = read_split(split, root)
     leak = refuse_leak(networks, [frame.name for frame in frames], allow_leak)

@@ -50,6 +50,10 @@ def many_view_protocol(
 
     Returns:
         One row for each recording; ``known`` is the share of pixels that were compared.
+
+    Raises:
+        DataError: no such recording, a leak that was not allowed, or no depth could be measured.
+        TrainingError: a recording gives no trajectory or no scale.
     """
     recordings = [each for name in sequences for each in named_recordings(root, name)] or discover(root)
     with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:

@@ -51,6 +51,9 @@ def snippet_errors(
         T_first_k_pred: predicted poses ``(S, K, 4, 4)``, any scale.
         T_first_k_true: true poses ``(S, K, 4, 4)``.
         fidelity: ``paper`` adds the four zero rows that the reference code averages over.
+
+    Raises:
+        ValueError: if the shapes differ or there is no snippet.
     """
     predicted = np.asarray(T_first_k_pred, dtype=np.float64)
     truth = np.asarray(T_first_k_true, dtype=np.float64)

@@ -74,6 +74,9 @@ def depth_protocol(
         uses no image. Of several streets these are means, ``abs_rel_se`` is the standard error over streets, and rows
         for each street follow. ``ratio`` is ``abs_rel`` over that of the first networks on the same street, of
         several streets the geometric mean, with its standard error over streets ``ratio_se``.
+
+    Raises:
+        DataError: no true depth under a root, or a leak that was not allowed.
     """
     streets = [street for root in roots for street in find_streets(root)]
     leaks = {
@@ -146,6 +149,10 @@ def pose_protocol(
 
     No snippet spans a gap, and a stretch between gaps that is shorter than one is passed over. In paper fidelity the
     truth is that of camera 0, whichever camera took the images.
+
+    Raises:
+        DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
+            not allowed.
     """
     length = networks.sources + 1
     rows = []

@@ -99,6 +99,9 @@ def lidar_depth(frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "de
 
     Returns:
         Metres ``(H, W)``, 0 where there is no point.
+
+    Raises:
+        DataError: scan or calibration is missing or malformed, or the image has another shape than the camera.
     """
     height, width = size
     date, path = frame.folder.parent, frame.folder / "velodyne_points" / "data" / f"{frame.index:010d}.bin"
@@ -125,6 +128,9 @@ def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
     """Distances in metres ``(N,)`` from a window's middle frame to the others, by the velocity of its GPS/IMU.
 
     Trapezoids over (north, east, up) velocities, as the reference does; ``window`` are consecutive frame numbers.
+
+    Raises:
+        DataError: a file is missing or malformed.
     """
     folder = frame.folder / "oxts"
     path = folder / "timestamps.txt"

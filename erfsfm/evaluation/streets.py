@@ -45,7 +45,11 @@ class Street:
 
 
 def find_streets(root: Path) -> list[Street]:
-    """Every street under a root: all pairs of a folder, every fifth frame of a recording or a drive."""
+    """Every street under a root: all pairs of a folder, every fifth frame of a recording or a drive.
+
+    Raises:
+        DataError: there is none, or depth maps of different sizes.
+    """
     if not root.exists():
         raise DataError(f"no data set at {root}: the path does not exist")
     streets = _of_pairs(root) or _of_drives(root) or _of_recordings(root)

@@ -1,1 +1,1 @@
-"""The command line: a module or a folder for each verb."""
+"""The command line: a module for each verb; what a user can mend is a ``SlamError`` of one line, from any of them."""

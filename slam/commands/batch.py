@@ -134,6 +134,9 @@ def run_drives(
         progress: is told how many have ended.
         threads: of a drive; None for the cores of this machine by the workers.
         memory_gib: that a drive may use; 0 for all.
+
+    Raises:
+        SlamError: a folder with files of others, or no such scheduler.
     """
     check_output(output, drives)
     output.mkdir(parents=True, exist_ok=True)

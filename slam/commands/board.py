@@ -132,7 +132,12 @@ class View:
 
 
 def find_views(images: ImageSource, board: Board, progress: Progress) -> list[View]:
-    """All views of a board, of a long video in every n-th image."""
+    """All views of a board, of a long video in every n-th image.
+
+    Raises:
+        SlamError: too few images show the board.
+        DataError, SequenceError: an image cannot be read.
+    """
     detector = cv2.aruco.CharucoDetector(board.charuco()) if board.pattern == "charuco" else None
     step = -(-len(images) // _MOST_SEARCHED)
     frames = range(0, len(images), step)

@@ -144,7 +144,11 @@ def calibrate_camera(
 
 
 def fit_camera(views: list[View], width: int, height: int, model: Model) -> Calibration:
-    """Fit a camera to views of a board; views that fit three times worse than the median are left out."""
+    """Fit a camera to views of a board; views that fit three times worse than the median are left out.
+
+    Raises:
+        SlamError: the views do not determine the camera, or no camera explains them.
+    """
     fit = _fit(views, width, height, model)
     good = fit.errors_px <= _OUTLIER * np.median(fit.errors_px)
     if not good.all():

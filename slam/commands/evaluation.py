@@ -72,7 +72,11 @@ def of_runs(paths: Sequence[Path], as_json: bool) -> None:
 
 
 def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool) -> None:
-    """One trajectory against another under every alignment, with the commands of evo that give the same."""
+    """One trajectory against another under every alignment, with the commands of evo that give the same.
+
+    Raises:
+        SlamError: a file cannot be read, or an error is over its limit.
+    """
     (run,) = compare([("", estimate)], reference, format)
     if as_json:
         typer.echo(run.errors.to_json())
@@ -143,6 +147,9 @@ def compare(
         reference: a trajectory file, or a run folder with a reference.
         format: of the files.
         frames: ``A:B`` of the reference, half-open; a file of B - A rows without frame numbers is of these frames.
+
+    Raises:
+        SlamError: a file cannot be read, or its poses do not belong to those of the reference.
     """
     truth = trajectory_at(reference, format, REFERENCE)
     chosen = None if frames is None else frame_range(frames, len(truth))

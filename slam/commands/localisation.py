@@ -170,6 +170,9 @@ class Localiser:
         """Localise an image ``(H, W, 3)`` uint8 RGB: at similar places, then in the map around.
 
         Points of learned depth are used beside triangulated ones where both agree, else only if these are too few.
+
+        Raises:
+            SequenceError: the image has another shape than its camera.
         """
         view = self._view(image)
         rows = self._index.nearest(view, _PLACES_TRIED)

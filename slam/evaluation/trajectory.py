@@ -146,6 +146,9 @@ def trajectory_metrics(
         estimate: the trajectory to evaluate.
         reference: the truth of the same frames, row k beside row k (see `slam.formats.trajectory.associate`).
         snippet5: the paper's protocol where it was measured directly; by default cut from the estimate.
+
+    Raises:
+        TrajectoryError: if the two have different lengths.
     """
     reason = _why_not(estimate, reference)
     if reference is None or reason:

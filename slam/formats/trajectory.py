@@ -112,6 +112,9 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     the columns of all. Stamps are seconds, or whole milli-, micro- or nanoseconds. A header, blank lines and those that
     start with ``#`` are skipped; bad rows are left out (`slam.formats.rows`), and where rows have no stamps the others
     keep their numbers. Rotations that are not orthonormal by rounding are replaced by the nearest rotation.
+
+    Raises:
+        TrajectoryError: if the file cannot be read as such; the message names file and line.
     """
     path = Path(path)
     if format not in ("auto", *_COLUMNS):
@@ -175,6 +178,9 @@ def associate(
 
     Of ``frames`` only these rows [start, stop) of the reference count; an estimate of as many rows is of these frames.
     ``TrajectoryError``: the lengths differ and stamps or frame numbers are missing, or none match.
+
+    Raises:
+        TrajectoryError: if the lengths differ and stamps or frame numbers are missing, or none match.
     """
     if not (estimate.timed and reference.timed):
         if frames is not None:

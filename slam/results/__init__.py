@@ -1,1 +1,1 @@
-"""Run folders: their files, report, tables, figures and exports."""
+"""Run folders: their files, report, tables and figures; a file that is damaged is a ``RunError`` of one line."""

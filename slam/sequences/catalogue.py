@@ -49,6 +49,9 @@ def open_sequence(
         camera: a ``camera.yaml``, or ``fov=DEGREES``; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
         truth: its true poses, in place of those that the data set has.
+
+    Raises:
+        SequenceError: one line on what was searched, where, what was found and what to do.
     """
     if dataset is None and name is None:
         for what, given in (("a camera file", camera), ("a file of true poses", truth)):

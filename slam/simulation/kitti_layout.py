@@ -43,6 +43,9 @@ def write_kitti_root(
         lidar: whether to write scans.
         progress: called with the number of frames written so far.
         mesh: whether to write all surfaces that stand still, as ``mesh.ply`` in the frame of the first camera.
+
+    Raises:
+        SequenceError: if ``output`` holds something already, or cannot be written; scans of a world without a LiDAR.
     """
     if lidar and world.T_camera_lidar is None:
         raise SequenceError(f"no LiDAR is carried through {world.options.route}: leave --lidar out")

@@ -42,6 +42,9 @@ def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variet
 
     A ``loop`` drives its start again, a ``grid`` repeats streets in both directions (with about 250 frames), and
     ``straight`` never comes back. Without a ``variety`` it is a town, and a camera like KITTI's.
+
+    Raises:
+        SequenceError: if there are too few frames for the route.
     """
     moving = frames - still_frames
     if moving < 2:

@@ -100,7 +100,11 @@ def read_camera_file(path: Path, own: Mapping[str, Any] | None = None) -> Camera
 
 
 def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
-    """The camera of the keys of a camera file, found at ``where``; an unlikely camera is logged as a warning."""
+    """The camera of the keys of a camera file, found at ``where``; an unlikely camera is logged as a warning.
+
+    Raises:
+        DataError: naming the key that is missing, unknown or wrong.
+    """
     try:
         camera = CameraFile.model_validate(keys)
     except ValidationError as error:

@@ -110,6 +110,9 @@ def read_image(path: Path, stretch: Stretch | None = None) -> Image:
     """Read an image as ``(H, W, 3)`` uint8 RGB; grey is repeated to three channels.
 
     Values of 16 bits are stretched; without a ``stretch`` by their own range.
+
+    Raises:
+        DataError: missing, empty, truncated or no image; one line.
     """
     return decode_image(_file_bytes(path), f"image {path}", stretch)
 

@@ -124,7 +124,8 @@ def test_networks_json(run: Run) -> None:
     assert by_name["depthnet"]["parameters"] == 31_596_900
     assert by_name["erf-posenet-dfc"]["parameters"] == 1_776_479
     assert by_name["depthnet"]["multiply_adds"] == pytest.approx(3.67e9, rel=0.01)
-    assert (by_name["posenet"]["receptive_field"], by_name["depthnet"]["receptive_field"]) == (263, 787)
+    fields = {"posenet": 263, "erf-posenet-dilated": 301, "depthnet": 787, "erf-depthnet-dilated": 829}
+    assert {name: by_name[name]["receptive_field"] for name in fields} == fields
     impossible = [row["name"] for row in rows if row["multiply_adds"] is None]
     assert impossible == ["erf-depthnet-dilated"]
     reasons = [value for key, value in by_name["erf-depthnet-dilated"].items() if "reason" in key]

@@ -2,17 +2,12 @@ import pytest
 
 from erfsfm.receptive_field import measure_fields, street_snippet
 
-SNIPPET = street_snippet(5, 128, 416)
+
+def by_name(names):
+    return {(row.name, row.fidelity): row for row in measure_fields(names, "default", street_snippet(5, 128, 416))}
 
 
-def by_name(names, **options):
-    return {
-        (row.name, row.fidelity): row
-        for row in measure_fields(names, options.pop("fidelity", "default"), SNIPPET, **options)
-    }
-
-
-def test_the_papers_dilated_network_follows_ours():
+def test_the_papers_dilated_network_follows_ours_and_reads_every_second_row_and_column():
     rows = by_name(["posenet", "erf-posenet-dilated"])
     assert list(rows) == [("posenet", "default"), ("erf-posenet-dilated", "default"), ("erf-posenet-dilated", "paper")]
     paper, ours = rows["erf-posenet-dilated", "paper"].summary(), rows["erf-posenet-dilated", "default"].summary()
@@ -21,21 +16,14 @@ def test_the_papers_dilated_network_follows_ours():
     assert paper["share_of_all_outputs"] == pytest.approx(0.25)
     assert ours["share_of_all_outputs"] == 1.0
     assert paper["effective_share_95"] <= paper["share"]
+    for at in (rows["erf-posenet-dilated", "paper"].seen.gradient > 0).nonzero(as_tuple=True):
+        assert (at % 2 == 1).all()
+    plain = rows["posenet", "default"].summary()
+    assert (plain["theoretical_px"], plain["offsets_px"], plain["columns"]) == (263, 0.0, 263)
 
 
-def test_the_papers_dilated_network_reads_every_second_row_and_column():
-    (row,) = measure_fields(["erf-posenet-dilated"], "paper", SNIPPET)
-    read = row.seen.gradient > 0
-    rows, columns = read.nonzero(as_tuple=True)
-    assert (rows % 2 == 1).all() and (columns % 2 == 1).all()
-
-
-@pytest.mark.parametrize(
-    "name, side, columns, fraction", [("erf-posenet-dfc", 511, 415, 0.998), ("posenet", 263, 263, 0.632)]
-)
-def test_pushed_taps(name, side, columns, fraction):
-    summary = by_name([name])[name, "default"].summary()
-    assert (summary["theoretical_px"], summary["theoretical_at_rest_px"]) == (side, 263)
-    assert summary["offsets_px"] == (1.0 if "dfc" in name else 0.0)
-    assert summary["columns"] == columns
-    assert summary["share"] == pytest.approx(fraction, abs=6e-4)
+def test_pushed_taps():
+    summary = by_name(["erf-posenet-dfc"])["erf-posenet-dfc", "default"].summary()
+    assert (summary["theoretical_px"], summary["theoretical_at_rest_px"]) == (511, 263)
+    assert (summary["offsets_px"], summary["columns"]) == (1.0, 415)
+    assert summary["share"] == pytest.approx(0.998, abs=6e-4)

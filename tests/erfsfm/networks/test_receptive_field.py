@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -49,7 +51,7 @@ def test_theoretical_corner_is_where_gradients_begin(name, fidelity, offsets_px)
     """On an image large enough for the whole field."""
     network = small(name, fidelity)
     side = theoretical(network, offsets_px)
-    size = 2 * side // 128 * 128
+    size = math.ceil(side / 256) * 256
     field = measured(network, (size, size), offsets_px=offsets_px)
     assert (field.top, field.left) == theoretical_corner(network, field.pixel, offsets_px)
     assert (field.rows, field.columns) == (side, side)
@@ -81,11 +83,8 @@ def test_measured(name, fidelity, size, pixel, map_size, box, coverage):
     [
         ("erf-posenet-dfc", 0.0, 263, 0.632),
         ("erf-posenet-dfc", 0.5, 415, 0.998),
-        ("erf-posenet-dfc", 1.0, 415, 0.998),
         ("erf-posenet-dfc", 2.0, 416, 1.0),
-        ("erf-posenet-dfcv2", 0.0, 263, 0.632),
         ("erf-posenet-dfcv2", 0.5, 293, 0.704),
-        ("erf-posenet-dfcv2", 1.0, 293, 0.694),
         ("erf-posenet-dfcv2", 2.0, 321, 0.767),
     ],
 )

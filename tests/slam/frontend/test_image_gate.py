@@ -125,10 +125,10 @@ def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> 
 
 
 def test_a_simulated_stop_is_not_frozen() -> None:
-    drive = SimulatedStreet(SimulationOptions("straight", 44, 704, 208, 64, ("stop",)))
+    drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 104, 32, ("stop",)))
     steps = np.linalg.norm(np.diff(drive.T_world_camera[:, :3, 3], axis=0), axis=1)
     assert (steps < 1e-9).sum() >= 10 and (steps > 0.5).sum() >= 10
-    images = [jpeg(drive.render(k).image, 60 + k % 28) for k in range(44)]
+    images = [jpeg(drive.render(k).image, 60 + k % 28) for k in range(60)]
     assert set(verdicts(images)) == {"new"}
 
 

@@ -37,9 +37,9 @@ def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> Float
 @functools.cache
 def lost_on_the_way() -> tuple[FloatArray, KeyframeOdometry]:
     """Two maps, and the true poses; on the way back the camera is rolled and closer."""
-    walked = there_and_back(110, roll=0.4, closer=0.3)
-    truth = np.concatenate([walked[:30], walked[48:]])
-    return truth, room.tracked(truth, [0] * 30 + [9] * 9 + [0] * 53)
+    walked = there_and_back(80, roll=0.4, closer=0.3)
+    truth = np.concatenate([walked[:22], walked[35:]])
+    return truth, room.tracked(truth, [0] * 22 + [9] * 7 + [0] * 38)
 
 
 def closed(state: KeyframeOdometry) -> MapClosure:
@@ -71,7 +71,7 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
     (join,) = after.joins
     assert join.event == "map joined"
     assert join.other is not None
-    assert join.other < 30 < 39 <= join.frame
+    assert join.other < 22 < 29 <= join.frame
     position, rotation = errors(after.poses, truth)
     assert position < 0.01
     assert rotation < 0.3

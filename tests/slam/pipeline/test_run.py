@@ -270,7 +270,7 @@ def test_images_without_corners_leave_only_network_factors() -> None:
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(20), atol=1e-3)
 
 
-STREET = 17
+STREET = 25
 
 
 @pytest.fixture(scope="module")
@@ -326,12 +326,12 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
     result, calls = driven
     solved = [("loops and graph", k, 1) for k in range(2)]
     assert calls == [("frames", k, STREET) for k in range(1, STREET + 1)] + solved + [
-        ("map", k, 9) for k in range(1, 10)
+        ("map", k, 13) for k in range(1, 14)
     ]
     seen = result.drive
-    assert len(seen.steps) > 10 and len(seen.steps) + len(seen.failures) == STREET - 1
+    assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == STREET - 1
     assert {f.ends for f in result.factors if f.source == "network"} == {(k, k + 1) for k in range(STREET - 1)}
-    assert len(seen.road_steps) > 6 and result.scale.lengths.keys() == triangulated(seen.steps).keys()
+    assert len(seen.road_steps) > 10 and result.scale.lengths.keys() == triangulated(seen.steps).keys()
     assert result.map is not None and result.map.statistics()["triangles"] > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
 
@@ -339,7 +339,7 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
 def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: SimulatedSequence) -> None:
     """In camera heights, which are no metres; depth of the sky is unknown."""
     result = drive_street(street, mode="none", sky=np.nan)
-    depths = [street.true_depth(k) for k in range(0, STREET, 4)]
+    depths = [street.true_depth(k) for k in range(0, STREET, 6)]
     nearness = np.median([np.median(depth[depth > 0]) for depth in depths]) / street.camera_height_m
     assert result.map is not None
     assert result.map.voxel_size == pytest.approx(0.2 * nearness / 15.0, rel=0.15)

@@ -92,7 +92,7 @@ def unit_after_a_walk(seed: int, keyframes: int = 10) -> float:
 
 
 def test_learned_depth_does_not_move_the_unit_of_a_map() -> None:
-    units = np.log([unit_after_a_walk(seed) for seed in range(8)])
+    units = np.log([unit_after_a_walk(seed) for seed in range(20)])
     assert abs(units.mean()) < 0.1
 
 

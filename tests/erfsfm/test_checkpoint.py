@@ -141,11 +141,11 @@ def test_the_same_variant_keeps_everything():
         torch.testing.assert_close(fresh.state_dict()[key], value)
 
 
-@pytest.mark.parametrize("other", [made("depthnet", width=0.5), made("posenet")])
-def test_another_network_is_refused_and_nothing_changes(other: torch.nn.Module):
+def test_another_network_is_refused_and_nothing_changes():
     fresh = made("erf-depthnet-dfc")
     before = {key: value.clone() for key, value in fresh.state_dict().items()}
-    with pytest.raises(ConfigError):
-        take_over(fresh, other.state_dict())
+    for other in (made("depthnet", width=0.5), made("posenet")):
+        with pytest.raises(ConfigError):
+            take_over(fresh, other.state_dict())
     for key, value in fresh.state_dict().items():
         torch.testing.assert_close(value, before[key])

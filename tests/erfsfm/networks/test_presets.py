@@ -9,7 +9,6 @@ def count(name, **options):
         return sum(parameter.numel() for parameter in build(name, **options).parameters())
 
 
-@pytest.mark.parametrize("fidelity", ["default", "paper"])
 @pytest.mark.parametrize(
     "name, wanted",
     [
@@ -19,11 +18,11 @@ def count(name, **options):
         ("erf-depthnet-dfcv2", 32_371_132),
     ],
 )
-def test_depth_parameters(name, fidelity, wanted):
-    assert count(name, fidelity=fidelity) == wanted
+def test_depth_parameters(name, wanted):
+    for fidelity in ("default", "paper"):
+        assert count(name, fidelity=fidelity) == wanted
 
 
-@pytest.mark.parametrize("fidelity", ["default", "paper"])
 @pytest.mark.parametrize(
     "name, four, two",
     [
@@ -33,9 +32,10 @@ def test_depth_parameters(name, fidelity, wanted):
         ("erf-posenet-dfcv2", 1_759_865, 1_708_859),
     ],
 )
-def test_pose_parameters(name, fidelity, four, two):
-    assert count(name, fidelity=fidelity) == four
-    assert count(name, fidelity=fidelity, sources=2) == two
+def test_pose_parameters(name, four, two):
+    for fidelity in ("default", "paper"):
+        assert count(name, fidelity=fidelity) == four
+        assert count(name, fidelity=fidelity, sources=2) == two
 
 
 def test_fidelity_decides_where_offsets_start():

@@ -39,15 +39,6 @@ def black(sequence: SimulatedSequence, index: int) -> Frame:
     return Frame(index, float(sequence.stamps[index]), np.zeros((64, 208, 3), np.uint8))
 
 
-def noise(sequence: SimulatedSequence, index: int) -> Frame:
-    image = np.random.default_rng(index).integers(0, 255, (64, 208, 3), np.uint8)
-    return Frame(index, float(sequence.stamps[index]), image)
-
-
-def repeated(sequence: SimulatedSequence, index: int) -> Frame:
-    return Frame(index, float(sequence.stamps[index]), sequence.frame(BAD[0] - 1).image)
-
-
 def repeated_as_jpeg(sequence: SimulatedSequence, index: int) -> Frame:
     """A frozen camera in a compressed video: the same image, encoded anew each time."""
     quality = 60 + 3 * (index - BAD[0])
@@ -145,13 +136,7 @@ def ate(result: Estimate) -> float:
     return float(trajectory_metrics(result.optimised, result.reference).align.dof7.ate_rmse_m)
 
 
-DAMAGES = [
-    *(black, repeated_as_jpeg, missing, unreadable),
-    *(pytest.param(damage, marks=pytest.mark.slow) for damage in (noise, repeated)),  # test_image_gate.py has both
-]
-
-
-@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("damage", [black, repeated_as_jpeg, missing, unreadable], ids=lambda damage: damage.__name__)
 def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
     result, warnings = run_on(damage)
     for each in (result.network, result.odometry, result.optimised):

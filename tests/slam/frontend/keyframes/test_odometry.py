@@ -38,11 +38,7 @@ def test_a_hand_held_camera_is_followed() -> None:
 def test_a_map_begins_on_a_plane(seed: int) -> None:
     """A wall faced squarely fits many essential matrices: with seed 5 theirs turned the camera by 90 degrees."""
     truth = room.walk(30)
-    odometry = KeyframeOdometry(room.INTRINSICS, seed)
-    for k, T_world_camera in enumerate(truth):
-        odometry.follow(room.frame(k, T_world_camera, near=False))
-        odometry.learn(room.frame(k, T_world_camera, near=False), room.depth_map(T_world_camera))
-    T = chained(poses(odometry).poses)
+    T = chained(poses(room.tracked(truth, near=False, draws=seed)).poses)
     estimate = np.stack([T[k] for k in range(30)])
     estimate = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True).apply_to_poses(estimate)
     turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
@@ -112,12 +108,7 @@ def test_without_learned_depth_there_is_no_map() -> None:
 def test_a_short_move_has_its_length_by_learned_depth() -> None:
     """A hundredth of the depth is too little parallax for points of their own; learned depth is twice the depth."""
     truth = from_rotation_vector(np.zeros((5, 3)), np.outer(np.arange(5), [0.01, 0.0, 0.0]))
-    odometry = KeyframeOdometry(room.INTRINSICS)
-    for k, T in enumerate(truth):
-        view = room.frame(k, T, near=False)
-        odometry.follow(view)
-        odometry.learn(view, room.depth_map(T))
-    T = chained(poses(odometry).poses)
+    T = chained(poses(room.tracked(truth, near=False)).poses)
     np.testing.assert_allclose(T[4][:3, 3], [0.08, 0.0, 0.0], atol=0.02)
 
 

@@ -225,18 +225,6 @@ def test_track_ids_link_the_lengths_of_neighbouring_steps(texture):
         assert 0 < ratio[1] < 0.01
 
 
-def test_the_true_length_makes_the_motion_true(texture):
-    truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 1.0]))
-    motion = measure(truth, texture, lambda depth: 2.0 * depth)
-    assert isinstance(motion, Motion)
-    length = float(np.linalg.norm(truth[:3, 3]))
-    metric = motion.with_length(length, 0.03, 0.09, NO_NOISE)
-    np.testing.assert_array_equal(metric.T_from_to[:3, :3], motion.relative_pose.T_from_to[:3, :3])
-    np.testing.assert_allclose(metric.T_from_to[:3, 3], truth[:3, 3], atol=0.02)
-    np.testing.assert_array_equal(metric.sigmas[:3], motion.relative_pose.sigmas[:3])
-    assert 0.03 <= metric.sigmas[5] < 0.035
-
-
 def test_a_rejected_motion_updates_neither_history_nor_dynamic_mask(texture):
     """Corners agree on a motion, but too few of them have a depth near enough to be trusted for its length."""
     frames, _ = drive(texture)

@@ -45,7 +45,7 @@ EVO = ("evo_traj", "evo_ape", "evo_res")
 PROGRAMS = ("erfsfm", "erfsfm-slam", "make", "pip", "python", *EVO)
 ADVICE = "add what it names to the workspace of this test, or a line to SHORTER or NOT_RUN"
 
-WIDTH, HEIGHT, FRAMES, FIRST_RUN, RAW_FRAMES = 208, 64, 20, 14, 9
+WIDTH, HEIGHT, FRAMES, FIRST_RUN, RAW_FRAMES = 208, 64, 16, 12, 9
 
 SHORTER: tuple[tuple[str, str], ...] = (
     # (pattern, replacement), applied to the whole command line one after another
@@ -260,7 +260,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.chdir(here)
         call(f"erfsfm-slam simulate world {size} --frames {FRAMES} --seed 700 --depth")
         call(f"erfsfm-slam simulate scanned {size} --frames {RAW_FRAMES} --seed 701 --lidar")
-        call(f"erfsfm-slam simulate held_out {size} --frames 60 --seed 501")
+        call(f"erfsfm-slam simulate held_out {size} --frames 30 --seed 501")
         train = "erfsfm train --config tiny --dataset world --set training.steps=2 --output"
         call(f"{train} runs/toy")
         call("erfsfm train --config tiny --dataset world --prepare prepared")

@@ -41,7 +41,7 @@ def test_theoretical(name, fidelity, wanted):
         ("erf-posenet-dilated", "default", 0.0),
         ("erf-posenet-dilated", "paper", 0.0),
         ("erf-posenet-dfc", "default", 1.0),
-        ("erf-posenet-dfcv2", "default", 0.5),
+        pytest.param("erf-posenet-dfcv2", "default", 0.5, marks=pytest.mark.slow),
     ],
 )
 def test_theoretical_corner_is_where_gradients_begin(name, fidelity, offsets_px):

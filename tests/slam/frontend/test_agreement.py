@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from erfsfm.common.command_line import Terminal
 from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
 from slam.frontend.drive import Drive, Segment
@@ -135,3 +137,18 @@ def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:
 @pytest.mark.parametrize(("is_metric", "is_carried"), [(False, False), (True, True)])
 def test_without_metres_and_of_a_carried_camera_no_number_is_said(is_metric: bool, is_carried: bool) -> None:
     assert isinstance(agreement.confidence([], is_metric, is_carried), Failed)
+
+
+def test_two_contradictions_are_two_warnings(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    Terminal(logging.WARNING)
+    for each in (agreement.Agreement("lidar", 3.0, "50 % off"), agreement.Agreement("GPS", 4.0, "far")):
+        each.said()
+    assert "lidar contradicts" in (said := capsys.readouterr().err) and "GPS contradicts" in said
+
+
+def test_a_frame_without_a_motion_has_no_support() -> None:
+    motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
+    assert agreement.frame_support(range(3), motions).tolist() == [0.7, 0.7, 0.0]

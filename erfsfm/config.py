@@ -13,6 +13,7 @@ from erfsfm.common.config_tree import Section
 from erfsfm.common.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
+NetworkKind = Literal["depth", "pose"]
 TrainedNetworks = Literal["both", "depth", "pose"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 _COARSEST = 32  # pixels: images are aligned from a 32nd of their size on

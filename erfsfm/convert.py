@@ -20,11 +20,10 @@ from pydantic import ValidationError
 from torch import Tensor
 
 import erfsfm
-from erfsfm.checkpoint import Absent, Model, build_networks, fill_network, save_model
+from erfsfm.checkpoint import Model, build_networks, fill_network, save_model
 from erfsfm.common.errors import CheckpointError
-from erfsfm.config import NetworkConfig
+from erfsfm.config import NetworkConfig, NetworkKind
 from erfsfm.model_record import ModelRecord, commit
-from erfsfm.networks.presets import NetworkKind
 
 _DEFORMABLE: dict[NetworkKind, dict[tuple[int, ...], str]] = {  # stages with offsets -> preset
     "depth": {(): "depthnet", (1, 2, 3, 4): "erf-depthnet-dfc", (4, 5, 6, 7): "erf-depthnet-dfcv2"},
@@ -88,19 +87,11 @@ def convert(
         commit=commit(),
         command=command,
     )
-    depth_net, pose_net = build_networks(record.network)
-    for kind, net in (("depth", depth_net), ("pose", pose_net)):
-        if kind in networks:
-            old = networks[kind]
-            fill_network(net, old.tensors, old.path, f"the reference's network with the layers of '{old.preset}'")
-    save_model(
-        output,
-        Model(
-            record,
-            depth_net if "depth" in networks else Absent("depth", output),
-            pose_net if "pose" in networks else Absent("pose", output),
-        ),
-    )
+    ours = build_networks(record.network)
+    for kind, old in networks.items():
+        wanted_by = f"the reference's network with the layers of '{old.preset}'"
+        fill_network(ours[kind], old.tensors, old.path, wanted_by)
+    save_model(output, Model(record, {kind: ours[kind] for kind in networks}))
     return list(networks.values())
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -23,16 +23,18 @@ from erfsfm.common.readers.images import read_image as read_image  # images are 
 from erfsfm.common.readers.images import resize_image
 from erfsfm.common.readers.pinhole import MOST_PIXELS
 from erfsfm.common.threads import usable_cores
+from erfsfm.config import NetworkKind
 from erfsfm.model_record import ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.model_record import record_of_whole_weights as record_of_whole_weights
 from erfsfm.networks.onnx_graph import OnnxGraph
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
+    from torch import nn
+
     from erfsfm.checkpoint import Model
 
 _BFLOAT16 = ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16")  # capabilities of a processor
-F = TypeVar("F", np.float32, np.float64)
 Array = NDArray[np.float32]
 Device = Literal["cpu", "cuda"]
 Runtime = Literal["torch", "onnx"]
@@ -86,15 +88,11 @@ class PreparedImage:
     array: Array
 
 
-class _Networks(NamedTuple):
-    depth: Network
-    pose: Network
-
-
 @lru_cache(maxsize=1)
-def _graphs(folder: Path, sha256: str) -> _Networks:
+def _graphs(folder: Path, sha256: str) -> dict[NetworkKind, OnnxGraph]:
     """Of the weights with this digest, each made by PyTorch only where it is not kept on disk."""
-    network = read_record(folder / "model.yaml").network
+    record = read_record(folder / "model.yaml")
+    config = record.network
 
     @cache
     def model() -> Model:
@@ -102,11 +100,15 @@ def _graphs(folder: Path, sha256: str) -> _Networks:
 
         return load_model(folder)
 
-    depth = OnnxGraph(lambda: model().depth_net, NETWORK_THREADS, f"depth {sha256} {network!r}")
-    pose = OnnxGraph(lambda: model().pose_net, NETWORK_THREADS, f"pose {sha256} {network!r}")
-    if not depth.is_kept((1, 3, network.height, network.width)):
+    def network(kind: NetworkKind) -> nn.Module:
+        return model().networks[kind]
+
+    graphs = {
+        kind: OnnxGraph(partial(network, kind), NETWORK_THREADS, f"{kind} {sha256} {config!r}") for kind in record.kinds
+    }
+    if "depth" not in graphs or not graphs["depth"].is_kept((1, 3, config.height, config.width)):
         model()  # damaged weights are found before the first image
-    return _Networks(depth, pose)
+    return graphs
 
 
 class DepthPosePredictor:
@@ -114,7 +116,9 @@ class DepthPosePredictor:
 
     origin: str = "these weights"
 
-    def __init__(self, record: ModelRecord, networks: _Networks, device: Device, sha256: str = "") -> None:
+    def __init__(
+        self, record: ModelRecord, networks: Mapping[NetworkKind, Network], device: Device, sha256: str = ""
+    ) -> None:
         self.device = device
         self.record = record
         self.sha256 = sha256
@@ -131,7 +135,7 @@ class DepthPosePredictor:
         from erfsfm.networks.torch_network import TorchNetwork
 
         chosen = choose_device(device)
-        networks = _Networks(TorchNetwork(model.depth_net, chosen), TorchNetwork(model.pose_net, chosen))
+        networks = {kind: TorchNetwork(network, chosen) for kind, network in model.networks.items()}
         return cls(model.record, networks, chosen, sha256)
 
     @classmethod
@@ -191,9 +195,9 @@ class DepthPosePredictor:
         """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the size of the training, as of a snippet.
 
         Raises:
-            CheckpointError: the network's output is not finite.
+            CheckpointError: there is no depth network, or its output is not finite.
         """
-        return self._finite(self._networks.depth(self._array(image))[0, 0], "depth")
+        return np.asarray(self._output("depth", self._array(image))[0])
 
     def poses(self, images: Sequence[NDArray[np.uint8] | PreparedImage]) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
@@ -207,7 +211,7 @@ class DepthPosePredictor:
 
         Raises:
             ValueError: another number of images than the networks were trained for, or several sizes.
-            CheckpointError: the network's output is not finite.
+            CheckpointError: there is no pose network, or its output is not finite.
         """
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
@@ -216,14 +220,17 @@ class DepthPosePredictor:
         middle = self.sources // 2
         inputs = [self._array(image) for image in images]
         target = inputs.pop(middle)
-        vectors = self._finite(self._networks.pose(target, inputs)[0].astype(np.float64), "pose")
+        vectors = self._output("pose", target, inputs).astype(np.float64)
         T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
         T_source_target[:, :3, :3] = Rotation.from_euler("XYZ", vectors[:, 3:]).as_matrix()
         T_source_target[:, :3, 3] = vectors[:, :3]
         return T_source_target
 
-    def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
-        """The output of a network, refused where it is not finite: float16 weights may overflow in a forward pass."""
+    def _output(self, kind: NetworkKind, *inputs: Array | list[Array]) -> Array:
+        """Of a network for one input, refused where it is not finite: float16 weights may overflow in the pass."""
+        if kind not in self._networks:
+            raise CheckpointError(f"{self.origin} holds no {kind} network: use weights that have both")
+        output: Array = self._networks[kind](*inputs)[0]
         if not np.isfinite(output).all():
             raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
         return output

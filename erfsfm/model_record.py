@@ -15,11 +15,11 @@ from safetensors.numpy import load_file
 
 from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
 from erfsfm.common.errors import CheckpointError
-from erfsfm.config import NetworkConfig
+from erfsfm.config import NetworkConfig, NetworkKind
 
 FORMAT: Literal[1] = 1
 SHIPPED = Path(__file__).parent / "weights"
-FILES = ("depth.safetensors", "pose.safetensors")
+KINDS: tuple[NetworkKind, NetworkKind] = ("depth", "pose")
 
 
 class DepthInput(Section):
@@ -46,6 +46,11 @@ class ModelRecord(Section):
     version: str = ""
     commit: str = ""
     command: str = ""
+
+    @property
+    def kinds(self) -> tuple[NetworkKind, ...]:
+        """Of the networks that are there."""
+        return KINDS if self.networks == "both" else (self.networks,)
 
     @field_validator("network", mode="before")
     @classmethod
@@ -87,6 +92,11 @@ def find_weights(name_or_folder: str | Path) -> Path:
     raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
 
 
+def tensors_file(folder: Path, kind: NetworkKind) -> Path:
+    """The weights of a network in a folder."""
+    return folder / f"{kind}.safetensors"
+
+
 def record_of_whole_weights(name_or_folder: str | Path) -> ModelRecord:
     """The record of weights whose tensors can be read and are finite, which needs no PyTorch.
 
@@ -95,7 +105,7 @@ def record_of_whole_weights(name_or_folder: str | Path) -> ModelRecord:
     """
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
-    for path in (folder / name for name in FILES if record.networks in ("both", Path(name).stem)):
+    for path in (tensors_file(folder, kind) for kind in record.kinds):
         try:
             is_finite = all(np.isfinite(tensor).all() for tensor in load_file(path).values())
         except (OSError, SafetensorError) as error:
@@ -108,7 +118,7 @@ def record_of_whole_weights(name_or_folder: str | Path) -> ModelRecord:
 def weights_sha256(folder: Path) -> str:
     """SHA-256 of both weight files together, and of the alignment of poses, which changes what they give."""
     digest = hashlib.sha256()
-    for path in (folder / name for name in FILES):
+    for path in (tensors_file(folder, kind) for kind in KINDS):
         digest.update(path.read_bytes() if path.is_file() else b"")
     alignment = read_record(folder / "model.yaml").network.alignment
     digest.update(b"" if alignment == "none" else alignment.encode())

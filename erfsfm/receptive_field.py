@@ -212,9 +212,8 @@ def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | No
     if learned is not None:
         title, model = learned
         config, kind = model.record.network, PRESETS[name].kind
-        trained = model.depth_net if kind == "depth" else model.pose_net
-        same = (config.depth if kind == "depth" else config.pose) == name and config.fidelity == fidelity
-        if same and isinstance(trained, Network):
+        trained = model.networks.get(kind)
+        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
             return trained, title
     return build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
 

@@ -7,14 +7,13 @@ from typing import Any, Literal, get_args
 import torch
 
 from erfsfm.common.errors import ConfigError
+from erfsfm.config import NetworkKind
 from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.image_alignment import Alignment
 from erfsfm.networks.lite0 import Lite0DepthNet
 from erfsfm.networks.pose_net import PoseNet
 from erfsfm.networks.receptive_field import Network, multiply_adds, theoretical
-
-NetworkKind = Literal["depth", "pose"]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
 from erfsfm.common.errors import TrainingError
-from erfsfm.config import ExperimentConfig, TrainedNetworks
+from erfsfm.config import ExperimentConfig, NetworkKind, TrainedNetworks
 from erfsfm.data.samples import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
@@ -23,7 +23,6 @@ from erfsfm.losses.structure import Bounds
 from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
-from erfsfm.networks.presets import NetworkKind
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
@@ -44,7 +43,7 @@ class SelfSupervision(lightning.LightningModule):
         super().__init__()
         self.config = config
         self._clock = clock
-        self.depth_net, self.pose_net = build_networks(config.network)
+        self.depth_net, self.pose_net = build_networks(config.network).values()
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self.depth_input: DepthInput | None = None  # of the network that this training goes on with
         self._choose_trained()

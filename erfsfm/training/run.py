@@ -24,7 +24,7 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from erfsfm.checkpoint import KINDS, load_model, take_over
+from erfsfm.checkpoint import load_model, take_over
 from erfsfm.common.errors import ConfigError
 from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.progress import Progress, silent
@@ -38,6 +38,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
+from erfsfm.model_record import KINDS
 from erfsfm.training.keeper import StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
@@ -212,7 +213,7 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
     """Load initial weights, also of another variant; returns what they were trained on."""
     name, wanted = config.initial_weights, config.network
     model = load_model(name) if name else None
-    loaded = [kind for kind in KINDS if model is not None and model.record.networks in ("both", kind)]
+    loaded = {} if model is None else model.networks
     if config.training.networks == "depth" and "pose" not in loaded and needs_poses(config):
         raise ConfigError(
             "training.networks: depth warps images by the motion of a pose network that was trained before, and there "
@@ -227,8 +228,7 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
     try:
         if model.record.network.model_copy(update=free) != wanted:
             raise ConfigError("only presets and alignment may differ")
-        for kind in loaded:
-            trained = model.depth_net if kind == "depth" else model.pose_net
+        for kind, trained in loaded.items():
             take_over(module.network(kind), trained.state_dict())
     except ConfigError as error:
         raise ConfigError(f"initial_weights '{name}' are of another network: {error}") from error

@@ -34,7 +34,7 @@ def run(command_line: Run) -> Run:
 def weights(tmp_path: Path) -> Path:
     config = NetworkConfig(depth_width=0.0625, pose_width=0.125, height=32, width=64)
     record = ModelRecord(network=config, trained_on=["simulated/17"])
-    save_model(tmp_path / "weights", Model(record, *build_networks(config)))
+    save_model(tmp_path / "weights", Model(record, build_networks(config)))
     return tmp_path / "weights"
 
 

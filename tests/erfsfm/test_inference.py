@@ -30,7 +30,7 @@ RNG = np.random.default_rng(3)
 def model(sources: Literal[2, 4] = 4, pose: str = "posenet") -> Model:
     config = NetworkConfig(depth_width=0.0625, pose=pose, pose_width=0.125, height=32, width=64, sources=sources)
     torch.manual_seed(0)
-    return Model(ModelRecord(network=config, trained_on=["kitti_odometry/00[0:250]"]), *build_networks(config))
+    return Model(ModelRecord(network=config, trained_on=["kitti_odometry/00[0:250]"]), build_networks(config))
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ class Echo(nn.Module):
 
 def echo(sources: Literal[2, 4] = 4) -> tuple[DepthPosePredictor, Echo]:
     net = Echo()
-    return DepthPosePredictor.of(Model(model(sources).record, net, net)), net
+    return DepthPosePredictor.of(Model(model(sources).record, {"depth": net, "pose": net})), net
 
 
 def test_networks_see_rgb_from_minus_one_to_one() -> None:
@@ -99,11 +99,11 @@ def test_a_single_image_may_be_seen_at_another_size_than_in_training() -> None:
     larger = DepthInput(height=64, width=128, disparity=0.5)
     plain = model()
     record = plain.record.model_copy(update={"depth_input": larger})
-    predictor = DepthPosePredictor.of(Model(record, plain.depth_net, plain.pose_net))
+    predictor = DepthPosePredictor.of(Model(record, plain.networks))
     large = image(64, 128)
     with torch.inference_mode():
         seen = torch.from_numpy(large.transpose(2, 0, 1)[None] / np.float32(127.5) - 1)
-        output = plain.depth_net(seen)[0, 0].numpy()
+        output = plain.networks["depth"](seen)[0, 0].numpy()
     np.testing.assert_allclose(predictor.depth(large), 2 / output, rtol=1e-5)
     assert predictor.disparity(large).shape == (32, 64)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError, field_validator
+from pydantic import ConfigDict, Field, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
+from erfsfm.common.config_tree import Section, read_model
 from erfsfm.common.errors import CheckpointError
 from erfsfm.config import NetworkConfig, NetworkKind
 
@@ -67,12 +67,7 @@ def read_record(path: Path) -> ModelRecord:
     Raises:
         CheckpointError: damaged, or of another format.
     """
-    try:
-        return ModelRecord.model_validate(read_yaml(path))
-    except YamlError as error:
-        raise CheckpointError(str(error)) from error
-    except ValidationError as error:
-        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {first_problem(error)}") from error
+    return read_model(ModelRecord, path, CheckpointError, f"is not a model record of format {FORMAT}")
 
 
 def find_weights(name_or_folder: str | Path) -> Path:

@@ -17,9 +17,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from erfsfm.common.config_tree import Section, YamlError, dump_yaml, first_problem, read_yaml
+from erfsfm.common.config_tree import Section, dump_yaml, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress
 from erfsfm.config import NetworkConfig
@@ -59,12 +59,7 @@ def _file(folder: Path, kind: Literal["images", "depth"], frame: int) -> Path:
 
 def read_prepared(root: Path) -> list[Recording]:
     """The recordings of a prepared folder; ``DataError`` where its index is damaged."""
-    try:
-        index = _Index.model_validate(read_yaml(root / INDEX_FILE))
-    except YamlError as error:
-        raise DataError(str(error)) from error
-    except ValidationError as error:
-        raise DataError(f"{root / INDEX_FILE} is damaged: {first_problem(error)}; prepare again") from error
+    index = read_model(_Index, root / INDEX_FILE, DataError, "is damaged, prepare again")
     return [_recording(root / f"{number:04d}", entry) for number, entry in enumerate(index.recordings)]
 
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
+from erfsfm.common.config_tree import Section, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.config import config_folders
 
@@ -49,12 +49,7 @@ def read_split_file(name_or_path: str) -> Split:
         if name_or_path not in shipped:
             raise DataError(f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}")
         path = shipped[name_or_path]
-    try:
-        return Split.model_validate(read_yaml(path) or {})
-    except YamlError as error:
-        raise DataError(str(error)) from error
-    except ValidationError as error:
-        raise DataError(f"{path} is no split of train, validation and test: {first_problem(error)}") from error
+    return read_model(Split, path, DataError, "is no split of train, validation and test")
 
 
 def _frames(name: str) -> list[tuple[str, int]]:

@@ -17,13 +17,12 @@ from erfsfm.config import ExperimentConfig, NetworkKind, TrainedNetworks
 from erfsfm.data.samples import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
-from erfsfm.geometry.transforms import pose_vector_to_matrix, project_into_source, sample
-from erfsfm.losses.photometric import photometric_error
+from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
 from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
-from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
+from erfsfm.training.objective import Level, ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -271,10 +270,6 @@ def learning_rate_factor(schedule: str, progress: float, step: int = _WARM_UP) -
 
 def _reconstruction_error(batch: dict[str, Tensor], disparity: Tensor, T_source_target: Tensor) -> float:
     """Mean over pixels of the smallest error among the sources (0.85 SSIM), whatever the training loss is."""
-    count = T_source_target.shape[1]
-    depth = (1 / disparity).repeat_interleave(count, dim=0)
-    projection = project_into_source(depth, T_source_target.flatten(0, 1), batch["K"].repeat_interleave(count, 0))
-    warped = sample(batch["sources"].flatten(0, 1), projection)
-    error = photometric_error(batch["target"].repeat_interleave(count, 0), warped, 0.85)
-    error = error.masked_fill(~projection.valid, torch.inf).unflatten(0, (-1, count)).amin(dim=1)
+    errors, valid = Level(batch["target"], batch["sources"], batch["K"], disparity).errors(T_source_target, 0.85)
+    error = errors.masked_fill(~valid, torch.inf).amin(dim=1)
     return float(error[torch.isfinite(error)].mean())

@@ -58,9 +58,8 @@ def save_model(folder: Path, model: Model, half: bool = False) -> None:
     for kind, net in model.networks.items():
         # through memory: errors of a full disk come from the library as an exception of its own
         content = save({key: _stored(key, value, half) for key, value in net.state_dict().items()})
-        write_atomically(tensors_file(folder, kind), lambda path, content=content: path.write_bytes(content))  # type: ignore[misc]
-    text = dump_yaml(model.record)
-    write_atomically(folder / "model.yaml", lambda path: path.write_text(text))
+        write_atomically(tensors_file(folder, kind), content)
+    write_atomically(folder / "model.yaml", dump_yaml(model.record))
 
 
 def load_model(name_or_folder: str | Path) -> Model:

@@ -91,7 +91,7 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
                 f"{file} was not written: onnxruntime differs from PyTorch by {difference:.1e} of the largest output "
                 f"of {preset}, more than {TOLERANCE:.0e}; report the versions of torch, onnx and onnxruntime"
             )
-        write_atomically(file, lambda part, content=content: part.write_bytes(content))  # type: ignore[misc]
+        write_atomically(file, content)
         files.append(Exported(file, kind, preset, difference))
     return files
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from ctypes.util import find_library
-from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -16,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from erfsfm.common.errors import CheckpointError, ConfigError, DataError
-from erfsfm.common.files import write_atomically
+from erfsfm.common.errors import CheckpointError, ConfigError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.common.readers.images import resize_image
@@ -79,13 +77,6 @@ def _may_have_gpu() -> bool:
     """Whether PyTorch was built for one and a driver is there; otherwise it need not be imported to be asked."""
     has_driver = any(Path("/dev", name).exists() for name in _GPU_DRIVERS) or find_library("cuda")
     return not version("torch").endswith("+cpu") and bool(has_driver or find_library("nvcuda"))
-
-
-@dataclass
-class PreparedImage:
-    """An image as a predictor's networks take it: resized, in [-1, 1], ``(1, 3, h, w)``."""
-
-    array: Array
 
 
 @lru_cache(maxsize=1)
@@ -183,27 +174,38 @@ class DepthPosePredictor:
         (height, width), size = image.shape[:2], self.record.depth_input
         if size is None:
             return depth_at(self.disparity(image), height, width)
-        seen = PreparedImage(self._input(image, size.height, size.width))
-        return depth_at(self.disparity(seen) * np.float32(size.disparity), height, width)
+        return depth_at(
+            self.disparity(_input(image, size.height, size.width)) * np.float32(size.disparity), height, width
+        )
 
-    def prepare(self, image: NDArray[np.uint8]) -> PreparedImage:
-        """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image."""
+    def prepare(self, image: NDArray[np.uint8] | Array) -> Array:
+        """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image.
+
+        Returns:
+            ``(1, 3, h, w)`` in [-1, 1] at the size of the training; an image that was prepared stays as it is.
+        """
+        if isinstance(image, np.ndarray) and image.ndim == 4 and image.dtype == np.float32:
+            return np.asarray(image, np.float32)
         network = self.record.network
-        return PreparedImage(self._input(image, network.height, network.width))
+        return _input(image, network.height, network.width)
 
-    def disparity(self, image: NDArray[np.uint8] | PreparedImage) -> NDArray[np.float32]:
+    def disparity(self, image: NDArray[np.uint8] | Array) -> NDArray[np.float32]:
         """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the size of the training, as of a snippet.
+
+        Args:
+            image: the image, or what `prepare` made of it.
 
         Raises:
             CheckpointError: there is no depth network, or its output is not finite.
         """
-        return np.asarray(self._output("depth", self._array(image))[0])
+        return np.asarray(self._output("depth", self.prepare(image))[0])
 
-    def poses(self, images: Sequence[NDArray[np.uint8] | PreparedImage]) -> NDArray[np.float64]:
+    def poses(self, images: Sequence[NDArray[np.uint8] | Array]) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
 
         Args:
-            images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle.
+            images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle, or what `prepare`
+                made of them.
 
         Returns:
             ``T_source_target`` ``(N, 4, 4)``, target camera to source camera, unscaled; row k belongs to
@@ -215,10 +217,10 @@ class DepthPosePredictor:
         """
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
-        if len(sizes := {image.shape for image in images if isinstance(image, np.ndarray)}) > 1:
+        if len(sizes := {image.shape for image in images if image.ndim == 3}) > 1:
             raise ValueError(f"images of a snippet must have one size; got {sorted(sizes)}")
         middle = self.sources // 2
-        inputs = [self._array(image) for image in images]
+        inputs = [self.prepare(image) for image in images]
         target = inputs.pop(middle)
         vectors = self._output("pose", target, inputs).astype(np.float64)
         T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
@@ -235,16 +237,13 @@ class DepthPosePredictor:
             raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
         return output
 
-    @staticmethod
-    def _input(image: NDArray[np.uint8], height: int, width: int) -> Array:
-        """An image at a network's size, in [-1, 1], ``(1, 3, height, width)``."""
-        require_image(image)
-        resized = resize_image(image, height, width)
-        scaled = resized.astype(np.float32) / np.float32(127.5) - np.float32(1)
-        return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
 
-    def _array(self, image: NDArray[np.uint8] | PreparedImage) -> Array:
-        return image.array if isinstance(image, PreparedImage) else self.prepare(image).array
+def _input(image: NDArray[np.uint8] | Array, height: int, width: int) -> Array:
+    """An image at a network's size, in [-1, 1], ``(1, 3, height, width)``."""
+    require_image(image)
+    resized = resize_image(np.asarray(image, np.uint8), height, width)
+    scaled = resized.astype(np.float32) / np.float32(127.5) - np.float32(1)
+    return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
 
 
 def require_image(image: object) -> None:
@@ -280,22 +279,3 @@ def colour_disparity(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
     low, high = np.percentile(disparity[is_known], [1, 98]) if is_known.any() else (0.0, 1.0)
     shade = np.clip((disparity - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
-
-
-def save_image(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an RGB image, whole or not at all."""
-    if path.suffix.lower() not in (".png", ".jpg"):
-        raise DataError(f"cannot write {path}: images are .png or .jpg")
-    require_image(image)
-    _, encoded = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]))
-    write_atomically(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
-
-
-def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
-    """Write a depth map as ``.npy``, whole or not at all."""
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.save(file, depth)
-
-    write_atomically(path, write)

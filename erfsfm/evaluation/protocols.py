@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +81,7 @@ def depth_protocol(
             if to_draw is not None and compared:
                 scaled = [guesses[name] * np.float32(compared[name].scale) for name in networks]
                 jpeg, file = _picture(image, scaled, truth), f"{street.name.replace('/', '-')}.jpg"
-                write_atomically(to_draw / file, partial(Path.write_bytes, data=jpeg))
+                write_atomically(to_draw / file, jpeg)
                 to_draw = None
             done += 1
         if not all(errors[name][place] for name in networks):

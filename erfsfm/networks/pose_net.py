@@ -47,8 +47,6 @@ class PoseNet(nn.Module):
         alignment: Alignment = "none",
     ) -> None:
         super().__init__()
-        self.variant = variant
-        self.fidelity = fidelity
         self.sources = sources
         self.alignment = alignment
         channels = [scaled(count, width) for count in _ENCODER_CHANNELS]

@@ -67,7 +67,7 @@ class OutputFolder:
 
     def write_config(self, config: ExperimentConfig) -> None:
         """Write the complete configuration of the run."""
-        write_atomically(self.path / CONFIG, lambda path: path.write_text(dump_yaml(config)))
+        write_atomically(self.path / CONFIG, dump_yaml(config))
 
 
 def _steps_of(checkpoint: Path) -> int:

@@ -301,7 +301,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
         """Write ``checkpoint`` to ``path``."""
         content = io.BytesIO()  # as in `save_model`
         torch.save(checkpoint, content)
-        write_atomically(Path(path), lambda part: part.write_bytes(content.getbuffer()))
+        write_atomically(Path(path), content.getvalue())
 
 
 def _single_threaded_worker(_: int) -> None:

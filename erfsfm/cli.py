@@ -364,7 +364,7 @@ def receptive_field(
     output.parent.mkdir(parents=True, exist_ok=True)
     draw_fields(rows, snippet[2], output)
     if as_json:
-        typer.echo(json.dumps([row.summary() for row in rows], indent=2))
+        typer.echo(json.dumps([row.summary for row in rows], indent=2))
         return
     field_table(rows).print()
     typer.echo(f"picture in {output}")

@@ -21,6 +21,7 @@ from torch import Tensor
 
 import erfsfm
 from erfsfm.checkpoint import Model, build_networks, fill_network, save_model
+from erfsfm.common.config_tree import first_problem
 from erfsfm.common.errors import CheckpointError
 from erfsfm.config import NetworkConfig, NetworkKind
 from erfsfm.model_record import ModelRecord, commit
@@ -220,6 +221,4 @@ def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -
     try:
         return NetworkConfig.model_validate(settings)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise CheckpointError(f"no network of ours has {where} {first['input']}: {first['msg'].lower()}") from error
+        raise CheckpointError(f"no network of ours has such layers: {first_problem(error)}") from error

@@ -29,7 +29,7 @@ from erfsfm.common.progress import Progress, duration, progress_bar, silent
 from erfsfm.common.table import Table
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.prepared import write_prepared
-from erfsfm.data.snippets import split_recordings
+from erfsfm.data.split import split_recordings
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.evaluation.protocols import named_recordings, pose_protocol
 from erfsfm.inference import DepthPosePredictor

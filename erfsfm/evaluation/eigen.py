@@ -15,7 +15,7 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.images import read_image, resize_image
 from erfsfm.config import Fidelity
-from erfsfm.data.split_file import read_split_file
+from erfsfm.data.split import read_split_file
 from erfsfm.evaluation.depth_metrics import CAP_M, DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
@@ -26,7 +26,7 @@ _FLAT_ROAD_M = 20.0
 
 
 def read_split(split: str, root: Path) -> list[RawFrame]:
-    """The frames to test on of a shipped split or a YAML file (`erfsfm.data.split_file`), or those of a list.
+    """The frames to test on of a shipped split or a YAML file (`erfsfm.data.split`), or those of a list.
 
     Args:
         split: ``eigen``, a file of the list ``test``, or any other file with a frame a line.

@@ -35,7 +35,8 @@ from erfsfm.config import ExperimentConfig, Precision
 from erfsfm.data.exact_depth import by_label, stacked
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
+from erfsfm.data.split import split_recordings, usable
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
 from erfsfm.model_record import KINDS

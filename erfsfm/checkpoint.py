@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import nn
 
 from erfsfm.common.config_tree import dump_yaml
 from erfsfm.common.errors import CheckpointError, ConfigError
 from erfsfm.common.files import write_atomically
 from erfsfm.config import NetworkConfig, NetworkKind
-from erfsfm.model_record import KINDS, ModelRecord, find_weights, read_record, tensors_file
+from erfsfm.model_record import KINDS, ModelRecord, find_weights, read_record, read_tensors, tensors_file
 from erfsfm.networks.presets import PRESETS, build
 
 
@@ -75,8 +74,8 @@ def load_model(name_or_folder: str | Path) -> Model:
     except ConfigError as error:
         raise CheckpointError(f"{folder / 'model.yaml'} names networks that cannot be built: {error}") from error
     for kind in record.kinds:
-        path = tensors_file(folder, kind)
-        fill_network(networks[kind].eval(), _read_tensors(path), path, "model.yaml says")
+        tensors = {key: torch.tensor(value) for key, value in read_tensors(folder, kind).items()}
+        fill_network(networks[kind].eval(), tensors, tensors_file(folder, kind), "model.yaml says")
     return Model(record, {kind: networks[kind] for kind in record.kinds})
 
 
@@ -95,7 +94,7 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
         wanted_by: source of the wanted architecture, for the error.
 
     Raises:
-        CheckpointError: of another architecture, or not numbers.
+        CheckpointError: of another architecture.
     """
     wanted = net.state_dict()
     if strange := sorted(wanted.keys() ^ tensors.keys()):
@@ -103,19 +102,7 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
     for key, value in tensors.items():
         if value.shape != wanted[key].shape:
             raise CheckpointError(f"{origin}: '{key}' has another shape than {wanted_by}: {tuple(value.shape)}")
-        if value.is_floating_point() and not torch.isfinite(value).all():
-            raise CheckpointError(f"{origin}: '{key}' holds NaN or infinite values: use other weights")
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
-
-
-def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    if not path.is_file():
-        raise CheckpointError(f"{path} is missing; copy the whole weights folder")
-    try:
-        tensors: dict[str, torch.Tensor] = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train again") from error
-    return tensors
 
 
 def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:

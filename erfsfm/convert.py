@@ -144,6 +144,9 @@ def _tensors(path: Path) -> dict[str, Tensor]:
     state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{path} holds no state_dict of tensors: it is no SfMLearner checkpoint")
+    for name, value in state.items():
+        if not torch.isfinite(value).all():
+            raise CheckpointError(f"{path}: '{name}' holds NaN or infinite values: use other weights")
     return {str(name).removeprefix("module."): value for name, value in state.items()}
 
 

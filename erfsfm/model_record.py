@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
@@ -100,14 +101,26 @@ def record_of_whole_weights(name_or_folder: str | Path) -> ModelRecord:
     """
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
-    for path in (tensors_file(folder, kind) for kind in record.kinds):
-        try:
-            is_finite = all(np.isfinite(tensor).all() for tensor in load_file(path).values())
-        except (OSError, SafetensorError) as error:
-            raise CheckpointError(f"{path} is missing or damaged ({error}); copy the whole weights folder") from error
-        if not is_finite:
-            raise CheckpointError(f"{path} holds NaN or infinite values; use other weights")
+    for kind in record.kinds:
+        read_tensors(folder, kind)
     return record
+
+
+def read_tensors(folder: Path, kind: NetworkKind) -> dict[str, NDArray[Any]]:
+    """The weights of a network in a folder, by name.
+
+    Raises:
+        CheckpointError: missing, damaged, or not finite.
+    """
+    path = tensors_file(folder, kind)
+    try:
+        tensors: dict[str, NDArray[Any]] = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path} is damaged or missing ({error}); copy the whole weights folder") from error
+    for key, value in tensors.items():
+        if not np.isfinite(value).all():
+            raise CheckpointError(f"{path}: '{key}' holds NaN or infinite values: use other weights")
+    return tensors
 
 
 def weights_sha256(folder: Path) -> str:

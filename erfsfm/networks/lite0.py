@@ -169,6 +169,8 @@ class Lite0DepthNet(DisparityNetwork):
     start as plain ones.
     """
 
+    encoder: Lite0Encoder
+
     def __init__(self, variant: Variant = "plain", width: float = 1.0) -> None:
         super().__init__()
         channels = [scaled(count, width) for count in _DECODER_CHANNELS]

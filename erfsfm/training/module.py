@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Self
 
 import lightning
@@ -21,7 +21,7 @@ from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
 from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
-from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
+from erfsfm.networks.lite0 import Lite0Conv, Lite0DepthNet
 from erfsfm.training.objective import Level, ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
@@ -57,27 +57,23 @@ class SelfSupervision(lightning.LightningModule):
         training = self.config.training
         self.depth_net.requires_grad_(training.networks != "pose")
         self.pose_net.requires_grad_(training.networks != "depth")
-        for network in (self.depth_net, self.pose_net):
-            encoder = getattr(network, "encoder", None)
-            if isinstance(encoder, Lite0Encoder):
-                encoder.freeze(training.frozen_stages)
-                # depthwise convolutions are a quarter faster so
-                network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if isinstance(self.depth_net, Lite0DepthNet):
+            self.depth_net.encoder.freeze(training.frozen_stages)
+            # depthwise convolutions are a quarter faster so
+            self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def network(self, kind: NetworkKind) -> nn.Module:
         """The network of that kind."""
         return self.depth_net if kind == "depth" else self.pose_net
 
-    def take_imagenet(self, kinds: Sequence[NetworkKind]) -> None:
-        """Start the pretrained encoders of these networks from ImageNet's weights.
+    def take_imagenet(self) -> None:
+        """Start the encoder of a lite0 network from ImageNet's weights.
 
         Raises:
             ConfigError: they are not installed.
         """
-        for kind in kinds:
-            encoder = getattr(self.network(kind), "encoder", None)
-            if isinstance(encoder, Lite0Encoder):
-                encoder.take_imagenet()
+        if isinstance(self.depth_net, Lite0DepthNet):
+            self.depth_net.encoder.take_imagenet()
 
     def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
         """Colour to [0, 1] where the networks are."""

@@ -39,7 +39,6 @@ from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
 from erfsfm.data.split import split_recordings, usable
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
-from erfsfm.model_record import KINDS
 from erfsfm.training.keeper import StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
@@ -176,7 +175,6 @@ def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> 
         config.training.batch,
         num_workers=workers,
         pin_memory=pin_memory,
-        worker_init_fn=_single_threaded_worker,
         collate_fn=stacked,
         persistent_workers=workers > 0,
     )
@@ -221,8 +219,8 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
             "is none: name weights that have one as initial_weights, or set teacher.views=many, or "
             "loss.photometric_weight=0"
         )
-    if config.pretrained == "imagenet":
-        module.take_imagenet([kind for kind in KINDS if kind not in loaded])
+    if config.pretrained == "imagenet" and "depth" not in loaded:
+        module.take_imagenet()
     if model is None:
         return []
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "alignment")}
@@ -303,8 +301,3 @@ class AtomicCheckpoints(TorchCheckpointIO):
         content = io.BytesIO()  # as in `save_model`
         torch.save(checkpoint, content)
         write_atomically(Path(path), content.getvalue())
-
-
-def _single_threaded_worker(_: int) -> None:
-    """One thread in a data loader process: the cores are the training step's."""
-    torch.set_num_threads(1)

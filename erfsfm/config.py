@@ -187,9 +187,7 @@ class TrainingConfig(Section):
     )
     batch: int = Field(default=4, ge=1, le=1024, description="snippets per step and device")
     devices: int = Field(
-        default=1,
-        ge=1,
-        description="GPUs, or processes on the CPU; batch normalisation is synchronised on GPUs alone",
+        default=1, ge=1, description="GPUs, or processes on the CPU; batch normalisation is synchronised on GPUs alone"
     )
     networks: TrainedNetworks = Field(
         default="both",

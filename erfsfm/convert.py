@@ -116,7 +116,8 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
         if stages:
             raise CheckpointError(f"{path} is deformable, not dilated: leave out --dilated")
         preset = "erf-posenet-dilated"
-    first = next(value for name, value in renamed.items() if name.startswith("encoder.stages.0.") and _is_kernel(name))
+    kernels = (".0.0.weight", ".kernel.weight")
+    first = next(v for name, v in renamed.items() if name.startswith("encoder.stages.0.") and name.endswith(kernels))
     head = renamed.get("pose_head.weight")
     return OldNetwork(
         path=path,
@@ -209,10 +210,6 @@ def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     if len(found) != 5:
         raise CheckpointError(f"{where} must hold offsets, modulator and kernel; found {', '.join(sorted(parts))}")
     return found
-
-
-def _is_kernel(name: str) -> bool:
-    return name.endswith(".0.0.weight") or name.endswith(".kernel.weight")
 
 
 def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -> NetworkConfig:

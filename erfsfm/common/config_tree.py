@@ -24,10 +24,7 @@ class Section(BaseModel):
 
 
 def load_config(
-    model: type[M],
-    file_or_name: str | Path | None,
-    overrides: Sequence[str],
-    shipped: Sequence[Path],
+    model: type[M], file_or_name: str | Path | None, overrides: Sequence[str], shipped: Sequence[Path]
 ) -> M:
     """Read a YAML file, or one of the ``shipped`` folders by its name; None for the defaults of the ``model``.
 

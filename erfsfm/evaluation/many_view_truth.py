@@ -61,11 +61,7 @@ def many_view_protocol(
 
 
 def many_view_errors(
-    networks: DepthPosePredictor,
-    recordings: Sequence[Recording],
-    cache: Path,
-    allow_leak: bool,
-    progress: Progress,
+    networks: DepthPosePredictor, recordings: Sequence[Recording], cache: Path, allow_leak: bool, progress: Progress
 ) -> list[dict[str, Any]]:
     """`many_view_protocol` of recordings."""
     leaks = [refuse_leak(networks, [each.frames_name], allow_leak) for each in recordings]

@@ -19,14 +19,7 @@ from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.evaluation.depth_metrics import (
-    CAP_M,
-    DepthErrors,
-    depth_errors,
-    mean_errors,
-    mean_ratio,
-    standard_error,
-)
+from erfsfm.evaluation.depth_metrics import CAP_M, DepthErrors, depth_errors, mean_errors, mean_ratio, standard_error
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
 from erfsfm.evaluation.streets import Street, find_streets
 from erfsfm.inference import DepthPosePredictor

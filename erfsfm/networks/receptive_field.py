@@ -101,10 +101,7 @@ def _jumps(layers: Sequence[Layer]) -> list[int]:
 
 
 def measured(
-    network: Network,
-    size: tuple[int, int] = (128, 416),
-    pixel: tuple[int, int] | None = None,
-    offsets_px: float = 0.0,
+    network: Network, size: tuple[int, int] = (128, 416), pixel: tuple[int, int] | None = None, offsets_px: float = 0.0
 ) -> MeasuredField:
     """Bounding box and coverage by input gradients, with constant positive weights and a white image.
 
@@ -165,10 +162,7 @@ def effective(network: Network, image: Tensor, pixel: tuple[int, int] | None = N
 
 
 def field_of(
-    encoder: Encoder,
-    image: Tensor,
-    pixel: tuple[int, int] | None = None,
-    rounding: float = 0.0,
+    encoder: Encoder, image: Tensor, pixel: tuple[int, int] | None = None, rounding: float = 0.0
 ) -> MeasuredField:
     """Field of one pixel of an encoder's output, by input gradients of the sum of its channels.
 

@@ -138,7 +138,7 @@ def _evaluate(
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if batch.bounds is not None:
-        teacher_terms = _teacher_terms(disparities, T_source_target, batch.T_source_target, batch.bounds, config)
+        teacher_terms = _teacher_terms(disparities, T_source_target, batch, batch.bounds, config)
         terms |= teacher_terms
         for name, weight in config.teacher.weights.items():
             total = total + weight * teacher_terms.get(name, total.new_zeros(()))
@@ -146,11 +146,7 @@ def _evaluate(
 
 
 def _teacher_terms(
-    disparities: list[Tensor],
-    T_source_target: Tensor,
-    T_measured: Tensor | None,
-    bounds: Bounds,
-    config: ExperimentConfig,
+    disparities: list[Tensor], T_source_target: Tensor, batch: SnippetBatch, bounds: Bounds, config: ExperimentConfig
 ) -> dict[str, Tensor]:
     """Loss terms of the teacher's labels."""
     terms: dict[str, Tensor] = {}
@@ -160,6 +156,7 @@ def _teacher_terms(
         terms["structure"] = torch.stack([disagreement(level, bounds, math.log(HEIGHTS)) for level in levels]).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)
+    T_measured = batch.T_source_target
     if needs_poses(config) and T_measured is not None:
         terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
         terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], T_measured[..., :3, 3] / HEIGHTS)

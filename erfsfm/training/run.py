@@ -32,7 +32,7 @@ from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import opencv_threads
 from erfsfm.config import ExperimentConfig, Precision
-from erfsfm.data.exact_depth import by_label, stacked
+from erfsfm.data.exact_depth import stacked
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
@@ -126,10 +126,9 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
         raise ConfigError("--prepare keeps whole recordings to validate on: set data.validation_share=0")
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
-    _, measured = by_label(training, config)
     held_out = ValidationSnippets(validation, config).snippets if validation else []
     with tempfile.TemporaryDirectory() as temporary:
-        teacher = measured_views(measured, config, config.teacher.cache or Path(temporary), progress)
+        teacher = measured_views(training, config, config.teacher.cache or Path(temporary), progress)
         write_prepared(output, training, held_out, teacher, config.network, progress)
 
 
@@ -162,8 +161,7 @@ def _draws(
     """What this process trains on; ``position``: steps done and rank."""
     done_steps, rank = position
     together = config.training.batch * config.training.devices
-    _, measured = by_label(training, config)
-    views = measured_views(measured, config, config.teacher.cache or output / MEASUREMENTS, progress)
+    views = measured_views(training, config, config.teacher.cache or output / MEASUREMENTS, progress)
     last, done = config.training.steps * together, done_steps * together
     return SnippetDraws(training, config, last, done, rank, views, imitated(config))
 

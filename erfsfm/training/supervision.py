@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import ConfigError
 from erfsfm.common.progress import Progress
 from erfsfm.config import ExperimentConfig
+from erfsfm.data.exact_depth import by_label
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
@@ -56,11 +57,12 @@ def measured_views(
     """The teacher, with what is not there yet measured; None where the experiment has no many views.
 
     Args:
-        recordings: to train on.
+        recordings: to train on; those with exact depth need no measurement.
         config: of the experiment.
         folder: of the measurements.
         progress: told of the stage, what is done, and of how many.
     """
+    _, measured = by_label(recordings, config)
     if config.teacher.views != "many":
         return None
     size = (config.network.height, config.network.width)
@@ -68,5 +70,5 @@ def measured_views(
     cache_mb = labels_mb(config.data)
     learned = partial(learned_inverse_depth, config.teacher.slam_weights)
     teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, with_depth, learned)
-    teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, progress)
+    teacher.prepare(measured, config.network.sources, config.teacher.slam_weights, progress)
     return teacher

@@ -27,7 +27,7 @@ from erfsfm.networks.presets import PRESETS, build
 from erfsfm.networks.receptive_field import (
     MeasuredField,
     Network,
-    effective,
+    field_of,
     measured,
     share_read,
     theoretical,
@@ -169,7 +169,7 @@ def _row(
     pushed = offsets_px if any(layer.deformable for layer in probe.encoder.layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
     network, weights = _with_weights(name, fidelity, learned)
-    weighed = effective(network.to(device), _encoder_input(snippet, network).to(device))
+    weighed = field_of(network.encoder.eval().to(device), _encoder_input(snippet, network).to(device))
     summary = {
         "name": name,
         "fidelity": fidelity,

@@ -145,32 +145,17 @@ def _evenly_weighted(network: Network, size: tuple[int, int], offsets_px: float)
     return encoder, torch.ones(1, network.input_channels, *size, dtype=torch.float64, device=device)
 
 
-def effective(network: Network, image: Tensor, pixel: tuple[int, int] | None = None) -> MeasuredField:
-    """Gradient-weighted field of the network as it is, its weights and offsets included (Luo et al. 2016).
-
-    Args:
-        network: any depth or pose network.
-        image: the encoder's input, ``(1, C, H, W)``; for a pose network target and sources stacked.
-        pixel: (row, column) of the observed output; its map's centre if None.
-    """
-    training = network.encoder.training
-    network.encoder.eval()
-    try:
-        return field_of(network.encoder, image, pixel)
-    finally:
-        network.encoder.train(training)
-
-
 def field_of(
     encoder: Encoder, image: Tensor, pixel: tuple[int, int] | None = None, rounding: float = 0.0
 ) -> MeasuredField:
     """Field of one pixel of an encoder's output, by input gradients of the sum of its channels.
 
-    All channels, since a single one may be zero behind its ReLU.
+    All channels, since a single one may be zero behind its ReLU. Of an encoder as it is, its weights and offsets
+    included, this is the gradient-weighted effective field (Luo et al. 2016).
 
     Args:
-        encoder: the encoder as it is.
-        image: its input, ``(1, C, H, W)``.
+        encoder: in evaluation mode.
+        image: its input, ``(1, C, H, W)``; of a pose network target and sources stacked.
         pixel: (row, column) of the observed output; its map's centre if None.
         rounding: ratio to the largest gradient up to which a gradient counts as zero.
     """

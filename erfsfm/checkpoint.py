@@ -6,16 +6,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save
 from torch import nn
 
 from erfsfm.common.config_tree import dump_yaml
-from erfsfm.common.errors import CheckpointError, ConfigError
+from erfsfm.common.errors import CheckpointError, ConfigError, ErfsfmError
 from erfsfm.common.files import write_atomically
 from erfsfm.config import NetworkConfig, NetworkKind
 from erfsfm.model_record import KINDS, ModelRecord, find_weights, read_record, read_tensors, tensors_file
@@ -103,6 +105,22 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
         if value.shape != wanted[key].shape:
             raise CheckpointError(f"{origin}: '{key}' has another shape than {wanted_by}: {tuple(value.shape)}")
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
+
+
+def read_torch(path: Path, error: type[ErfsfmError], wrong: str) -> Any:
+    """What PyTorch saved, tensors and plain values alone: no code in it can run.
+
+    Raises:
+        ErfsfmError: of the given kind, that says what is ``wrong`` with the file.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Detected pickle protocol")
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception as cause:  # a damaged file makes PyTorch raise anything, failed assertions too
+        raise error(f"{path} {wrong}") from cause
 
 
 def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:

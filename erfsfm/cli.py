@@ -260,7 +260,7 @@ def predict(
     import numpy as np
 
     from erfsfm.common.files import write_array, write_atomically
-    from erfsfm.common.readers.images import list_images, read_image
+    from erfsfm.common.readers.images import list_images, read_image, report_unreadable
     from erfsfm.inference import DepthPosePredictor, colour_disparity
 
     if output.is_file():
@@ -289,10 +289,7 @@ def predict(
         write_array(depth_file, partial(np.save, arr=depth))
         picture = cv2.imencode(".png", colour_disparity(depth)[..., ::-1])[1]
         write_atomically(depth_file.with_suffix(".png"), bytes(picture))
-    if len(unreadable) == len(files):
-        raise DataError(unreadable[0])
-    if unreadable:
-        logger.warning("%d of %d images are left out: %s", len(unreadable), len(files), unreadable[0])
+    report_unreadable(unreadable, len(files), "images")
     typer.echo(f"depth of {len(files) - len(unreadable)} images in {output}")
 
 

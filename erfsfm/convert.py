@@ -7,9 +7,7 @@ Plain and dilated networks have the same weights: the user must tell which it wa
 
 from __future__ import annotations
 
-import pickle
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +18,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 import erfsfm
-from erfsfm.checkpoint import Model, build_networks, fill_network, save_model
+from erfsfm.checkpoint import Model, build_networks, fill_network, read_torch, save_model
 from erfsfm.common.config_tree import first_problem
 from erfsfm.common.errors import CheckpointError
 from erfsfm.config import NetworkConfig, NetworkKind
@@ -132,16 +130,8 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
 def _tensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise CheckpointError(f"no file {path}: give a .pth.tar of SfMLearner-PyTorch or ERF-SfMLearner")
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Detected pickle protocol")
-            loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise CheckpointError(f"{path} is damaged, no checkpoint, or would execute code: get it again") from error
-    except MemoryError:
-        raise
-    except Exception as error:  # a damaged file makes PyTorch raise anything, failed assertions too
-        raise CheckpointError(f"{path} is damaged or no checkpoint ({type(error).__name__}); copy it again") from error
+    wrong = "is damaged, no checkpoint, or would execute code: get it again"
+    loaded = read_torch(path, CheckpointError, wrong)
     state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{path} holds no state_dict of tensors: it is no SfMLearner checkpoint")

@@ -7,7 +7,6 @@ record the same training data.
 
 from __future__ import annotations
 
-import logging
 import os
 import shutil
 from collections.abc import Sequence
@@ -22,13 +21,12 @@ from pydantic import Field
 from erfsfm.common.config_tree import Section, dump_yaml, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress
+from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import NetworkConfig
 from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher, encode
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import Snippet
 from erfsfm.geometry.camera import Camera
-
-logger = logging.getLogger(__name__)
 
 INDEX_FILE = "prepared.yaml"
 _POSES, _LABELS = "poses.txt", "labels"  # of a recording: true poses of its camera (KITTI), and the teacher's
@@ -100,11 +98,7 @@ def write_prepared(
                     _put(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]))
             elif teacher is not None:
                 _write_labels(teacher.drive(recording), folder / _LABELS, network)
-        total = sum(map(len, recordings))
-        if len(unreadable) == total:
-            raise DataError(f"none of {total} images can be read: {unreadable[0]}")
-        if unreadable:
-            logger.warning("%d of %d images cannot be read and are left out: %s", len(unreadable), total, unreadable[0])
+        report_unreadable(unreadable, sum(map(len, recordings)), "images")
         entries = _Index(recordings=[_entry(recording, network) for recording in recordings])
         (unfinished / INDEX_FILE).write_text(dump_yaml(entries))
         unfinished.replace(output)

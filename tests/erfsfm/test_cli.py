@@ -174,7 +174,7 @@ def test_predict_leaves_out_what_it_cannot_read(
     given = ["predict", images, "--weights", weights, "--output", depth]
     code, out, _ = run(*given)
     assert code == 0 and f"depth of 2 images in {depth}" in out
-    assert "1 of 3 images are left out" in caplog.text and "b.png is truncated" in caplog.text
+    assert "1 of 3 images cannot be read and are left out" in caplog.text and "b.png is truncated" in caplog.text
     assert sorted(p.name for p in depth.iterdir()) == ["a.npy", "a.png", "c.npy", "c.png"]
 
 

@@ -6,76 +6,46 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import nn
 
 from erfsfm.common.config_tree import dump_yaml
-from erfsfm.common.errors import CheckpointError, ConfigError
+from erfsfm.common.errors import CheckpointError, ConfigError, ErfsfmError
 from erfsfm.common.files import write_atomically
-from erfsfm.config import NetworkConfig
-from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record
-from erfsfm.networks.presets import PRESETS, NetworkKind, build
-
-KINDS: tuple[NetworkKind, NetworkKind] = ("depth", "pose")
+from erfsfm.config import NetworkConfig, NetworkKind
+from erfsfm.model_record import KINDS, ModelRecord, find_weights, read_record, read_tensors, tensors_file
+from erfsfm.networks.presets import PRESETS, build
 
 
 @dataclass(frozen=True)
 class Model:
-    """Two networks and their record."""
+    """Trained networks, both or one of them, and their record."""
 
     record: ModelRecord
-    depth_net: nn.Module
-    pose_net: nn.Module
+    networks: Mapping[NetworkKind, nn.Module]
 
 
-class Absent(nn.Module):
-    """Placeholder where a folder holds only one of the two networks; using it raises an error."""
-
-    def __init__(self, kind: NetworkKind, folder: Path) -> None:
-        super().__init__()
-        self.kind = kind
-        self._folder = folder
-
-    def forward(self, *_images: Any) -> Any:
-        """Refuse.
-
-        Raises:
-            CheckpointError: always.
-        """
-        raise CheckpointError(f"{self._folder} holds no {self.kind} network: use weights that have both")
-
-    def state_dict(self, *_args: Any, **_options: Any) -> Any:
-        """Refuse, as `forward` does."""
-        return self.forward()
-
-
-def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
+def build_networks(config: NetworkConfig) -> dict[NetworkKind, nn.Module]:
     """Freshly initialised depth and pose networks.
 
     Raises:
         ConfigError: an unknown preset, or one of the other kind.
     """
-    _require_kind("depth", config.depth)
-    _require_kind("pose", config.pose)
-
-    def built(name: str, width: float) -> nn.Module:
-        rest = config.normalisation, config.activation, config.alignment
-        return build(name, config.fidelity, width, config.sources, *rest)
-
-    return built(config.depth, config.depth_width), built(config.pose, config.pose_width)
-
-
-def _require_kind(kind: NetworkKind, name: str) -> None:
-    """Refuse a pose network where depth is wanted, and the reverse; `build` refuses unknown names."""
-    if name in PRESETS and PRESETS[name].kind != kind:
-        known = ", ".join(other for other, preset in PRESETS.items() if preset.kind == kind)
-        raise ConfigError(f"network.{kind} must be a {kind} network ({known}); got '{name}'")
+    presets = config.depth, config.pose
+    for kind, name in zip(KINDS, presets):
+        if name in PRESETS and PRESETS[name].kind != kind:  # `build` refuses unknown names
+            known = ", ".join(other for other, preset in PRESETS.items() if preset.kind == kind)
+            raise ConfigError(f"network.{kind} must be a {kind} network ({known}); got '{name}'")
+    rest = config.sources, config.normalisation, config.activation, config.alignment
+    widths = config.depth_width, config.pose_width
+    return {kind: build(name, config.fidelity, width, *rest) for kind, name, width in zip(KINDS, presets, widths)}
 
 
 def save_model(folder: Path, model: Model, half: bool = False) -> None:
@@ -86,14 +56,11 @@ def save_model(folder: Path, model: Model, half: bool = False) -> None:
         model: what to write.
         half: store weights in half precision (BatchNorm statistics stay in single precision).
     """
-    for name, net in zip(FILES, (model.depth_net, model.pose_net)):
-        if isinstance(net, Absent):
-            continue
+    for kind, net in model.networks.items():
         # through memory: errors of a full disk come from the library as an exception of its own
         content = save({key: _stored(key, value, half) for key, value in net.state_dict().items()})
-        write_atomically(folder / name, lambda path, content=content: path.write_bytes(content))  # type: ignore[misc]
-    text = dump_yaml(model.record)
-    write_atomically(folder / "model.yaml", lambda path: path.write_text(text))
+        write_atomically(tensors_file(folder, kind), content)
+    write_atomically(folder / "model.yaml", dump_yaml(model.record))
 
 
 def load_model(name_or_folder: str | Path) -> Model:
@@ -105,15 +72,13 @@ def load_model(name_or_folder: str | Path) -> Model:
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
     try:
-        nets: list[nn.Module] = list(build_networks(record.network))
+        networks = build_networks(record.network)
     except ConfigError as error:
         raise CheckpointError(f"{folder / 'model.yaml'} names networks that cannot be built: {error}") from error
-    for index, (kind, name) in enumerate(zip(KINDS, FILES)):
-        if record.networks in ("both", kind):
-            fill_network(nets[index], _read_tensors(folder / name), folder / name, "model.yaml says")
-        else:
-            nets[index] = Absent(kind, folder)
-    return Model(record, nets[0].eval(), nets[1].eval())
+    for kind in record.kinds:
+        tensors = {key: torch.tensor(value) for key, value in read_tensors(folder, kind).items()}
+        fill_network(networks[kind].eval(), tensors, tensors_file(folder, kind), "model.yaml says")
+    return Model(record, {kind: networks[kind] for kind in record.kinds})
 
 
 def _stored(key: str, value: torch.Tensor, half: bool) -> torch.Tensor:
@@ -131,7 +96,7 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
         wanted_by: source of the wanted architecture, for the error.
 
     Raises:
-        CheckpointError: of another architecture, or not numbers.
+        CheckpointError: of another architecture.
     """
     wanted = net.state_dict()
     if strange := sorted(wanted.keys() ^ tensors.keys()):
@@ -139,19 +104,23 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
     for key, value in tensors.items():
         if value.shape != wanted[key].shape:
             raise CheckpointError(f"{origin}: '{key}' has another shape than {wanted_by}: {tuple(value.shape)}")
-        if value.is_floating_point() and not torch.isfinite(value).all():
-            raise CheckpointError(f"{origin}: '{key}' holds NaN or infinite values: use other weights")
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
 
 
-def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    if not path.is_file():
-        raise CheckpointError(f"{path} is missing; copy the whole weights folder")
+def read_torch(path: Path, error: type[ErfsfmError], wrong: str) -> Any:
+    """What PyTorch saved, tensors and plain values alone: no code in it can run.
+
+    Raises:
+        ErfsfmError: of the given kind, that says what is ``wrong`` with the file.
+    """
     try:
-        tensors: dict[str, torch.Tensor] = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train again") from error
-    return tensors
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Detected pickle protocol")
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception as cause:  # a damaged file makes PyTorch raise anything, failed assertions too
+        raise error(f"{path} {wrong}") from cause
 
 
 def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:

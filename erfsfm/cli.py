@@ -8,6 +8,7 @@ import math
 import shlex
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -200,7 +201,7 @@ def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> Non
     from erfsfm.common.files import write_atomically
 
     if output is not None:
-        write_atomically(output, lambda path: path.write_text(json.dumps(rows, indent=2) + "\n"))
+        write_atomically(output, json.dumps(rows, indent=2) + "\n")
     print_rows(rows if as_json else _narrow(rows), as_json)
 
 
@@ -255,8 +256,12 @@ def predict(
 
     Example: erfsfm predict drive/images --weights default --output depth
     """
-    from erfsfm.common.readers.images import list_images
-    from erfsfm.inference import DepthPosePredictor, colour_disparity, read_image, save_depth, save_image
+    import cv2
+    import numpy as np
+
+    from erfsfm.common.files import write_array, write_atomically
+    from erfsfm.common.readers.images import list_images, read_image, report_unreadable
+    from erfsfm.inference import DepthPosePredictor, colour_disparity
 
     if output.is_file():
         raise DataError(f"{output} is a file: give a folder as --output")
@@ -281,12 +286,10 @@ def predict(
             continue
         output.mkdir(parents=True, exist_ok=True)
         depth = predictor.depth(image)
-        save_depth(depth_file, depth)
-        save_image(depth_file.with_suffix(".png"), colour_disparity(depth))
-    if len(unreadable) == len(files):
-        raise DataError(unreadable[0])
-    if unreadable:
-        logger.warning("%d of %d images are left out: %s", len(unreadable), len(files), unreadable[0])
+        write_array(depth_file, partial(np.save, arr=depth))
+        picture = cv2.imencode(".png", colour_disparity(depth)[..., ::-1])[1]
+        write_atomically(depth_file.with_suffix(".png"), bytes(picture))
+    report_unreadable(unreadable, len(files), "images")
     typer.echo(f"depth of {len(files) - len(unreadable)} images in {output}")
 
 
@@ -358,7 +361,7 @@ def receptive_field(
     output.parent.mkdir(parents=True, exist_ok=True)
     draw_fields(rows, snippet[2], output)
     if as_json:
-        typer.echo(json.dumps([row.summary() for row in rows], indent=2))
+        typer.echo(json.dumps([row.summary for row in rows], indent=2))
         return
     field_table(rows).print()
     typer.echo(f"picture in {output}")

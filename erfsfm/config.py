@@ -13,6 +13,7 @@ from erfsfm.common.config_tree import Section
 from erfsfm.common.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
+NetworkKind = Literal["depth", "pose"]
 TrainedNetworks = Literal["both", "depth", "pose"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 _COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
@@ -186,9 +187,7 @@ class TrainingConfig(Section):
     )
     batch: int = Field(default=4, ge=1, le=1024, description="snippets per step and device")
     devices: int = Field(
-        default=1,
-        ge=1,
-        description="GPUs, or processes on the CPU; batch normalisation is synchronised on GPUs alone",
+        default=1, ge=1, description="GPUs, or processes on the CPU; batch normalisation is synchronised on GPUs alone"
     )
     networks: TrainedNetworks = Field(
         default="both",

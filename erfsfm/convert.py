@@ -7,9 +7,7 @@ Plain and dilated networks have the same weights: the user must tell which it wa
 
 from __future__ import annotations
 
-import pickle
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +18,11 @@ from pydantic import ValidationError
 from torch import Tensor
 
 import erfsfm
-from erfsfm.checkpoint import Absent, Model, build_networks, fill_network, save_model
+from erfsfm.checkpoint import Model, build_networks, fill_network, read_torch, save_model
+from erfsfm.common.config_tree import first_problem
 from erfsfm.common.errors import CheckpointError
-from erfsfm.config import NetworkConfig
+from erfsfm.config import NetworkConfig, NetworkKind
 from erfsfm.model_record import ModelRecord, commit
-from erfsfm.networks.presets import NetworkKind
 
 _DEFORMABLE: dict[NetworkKind, dict[tuple[int, ...], str]] = {  # stages with offsets -> preset
     "depth": {(): "depthnet", (1, 2, 3, 4): "erf-depthnet-dfc", (4, 5, 6, 7): "erf-depthnet-dfcv2"},
@@ -88,19 +86,11 @@ def convert(
         commit=commit(),
         command=command,
     )
-    depth_net, pose_net = build_networks(record.network)
-    for kind, net in (("depth", depth_net), ("pose", pose_net)):
-        if kind in networks:
-            old = networks[kind]
-            fill_network(net, old.tensors, old.path, f"the reference's network with the layers of '{old.preset}'")
-    save_model(
-        output,
-        Model(
-            record,
-            depth_net if "depth" in networks else Absent("depth", output),
-            pose_net if "pose" in networks else Absent("pose", output),
-        ),
-    )
+    ours = build_networks(record.network)
+    for kind, old in networks.items():
+        wanted_by = f"the reference's network with the layers of '{old.preset}'"
+        fill_network(ours[kind], old.tensors, old.path, wanted_by)
+    save_model(output, Model(record, {kind: ours[kind] for kind in networks}))
     return list(networks.values())
 
 
@@ -124,7 +114,8 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
         if stages:
             raise CheckpointError(f"{path} is deformable, not dilated: leave out --dilated")
         preset = "erf-posenet-dilated"
-    first = next(value for name, value in renamed.items() if name.startswith("encoder.stages.0.") and _is_kernel(name))
+    kernels = (".0.0.weight", ".kernel.weight")
+    first = next(v for name, v in renamed.items() if name.startswith("encoder.stages.0.") and name.endswith(kernels))
     head = renamed.get("pose_head.weight")
     return OldNetwork(
         path=path,
@@ -139,19 +130,14 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
 def _tensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise CheckpointError(f"no file {path}: give a .pth.tar of SfMLearner-PyTorch or ERF-SfMLearner")
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Detected pickle protocol")
-            loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise CheckpointError(f"{path} is damaged, no checkpoint, or would execute code: get it again") from error
-    except MemoryError:
-        raise
-    except Exception as error:  # a damaged file makes PyTorch raise anything, failed assertions too
-        raise CheckpointError(f"{path} is damaged or no checkpoint ({type(error).__name__}); copy it again") from error
+    wrong = "is damaged, no checkpoint, or would execute code: get it again"
+    loaded = read_torch(path, CheckpointError, wrong)
     state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{path} holds no state_dict of tensors: it is no SfMLearner checkpoint")
+    for name, value in state.items():
+        if not torch.isfinite(value).all():
+            raise CheckpointError(f"{path}: '{name}' holds NaN or infinite values: use other weights")
     return {str(name).removeprefix("module."): value for name, value in state.items()}
 
 
@@ -216,10 +202,6 @@ def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return found
 
 
-def _is_kernel(name: str) -> bool:
-    return name.endswith(".0.0.weight") or name.endswith(".kernel.weight")
-
-
 def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -> NetworkConfig:
     settings: dict[str, Any] = {"fidelity": "paper", "height": size[0], "width": size[1]}
     for kind, network in networks.items():
@@ -229,6 +211,4 @@ def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -
     try:
         return NetworkConfig.model_validate(settings)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise CheckpointError(f"no network of ours has {where} {first['input']}: {first['msg'].lower()}") from error
+        raise CheckpointError(f"no network of ours has such layers: {first_problem(error)}") from error

@@ -14,11 +14,11 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from erfsfm.checkpoint import Absent, Model
+from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ExportError
 from erfsfm.common.files import refuse_foreign, write_atomically
 from erfsfm.common.threads import open_session
-from erfsfm.networks.presets import NetworkKind
+from erfsfm.config import NetworkKind
 from erfsfm.networks.torch_network import exported
 
 # of the largest output; a thousand roundings of float32
@@ -58,7 +58,7 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
     """Write the depth network to ``path`` and the pose network to `pose_path`, if onnxruntime agrees with PyTorch.
 
     Args:
-        model: of which a network that is absent is left out.
+        model: one network or both.
         path: must end in ``.onnx``.
         seed: of the random images on which both are compared.
 
@@ -74,18 +74,16 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
     smooth = nn.functional.interpolate(coarse, size=(config.height, config.width), mode="bilinear")
     noisy = torch.rand(*smooth.shape, generator=generator)
     examples = [(2 * images[:1] - 1, 2 * images[None, 1:] - 1) for images in (smooth, noisy)]
-    wanted: list[tuple[NetworkKind, str, Path, nn.Module, dict[str, int]]] = []
-    if not isinstance(model.depth_net, Absent):
-        wanted.append(("depth", config.depth, path, model.depth_net, {"image": 0}))
-    if not isinstance(model.pose_net, Absent):
-        wanted.append(("pose", config.pose, pose_path(path), PoseGraph(model.pose_net), {"target": 0, "sources": 1}))
-    for _, _, file, _, _ in wanted:
-        refuse_foreign([file], _MARK, ExportError)
+    paths = {"depth": path, "pose": pose_path(path)}
+    for kind in model.networks:
+        refuse_foreign([paths[kind]], _MARK, ExportError)
     files = []
-    for kind, preset, file, network, inputs in wanted:
-        given = [{name: example[which] for name, which in inputs.items()} for example in examples]
-        output = "disparity" if kind == "depth" else "T_source_target"
-        graph = exported(network.eval(), [*given[0].values()], [*inputs], [output])
+    for kind, trained in model.networks.items():
+        file, preset = paths[kind], getattr(config, kind)
+        network = trained if kind == "depth" else PoseGraph(trained)
+        inputs, output = (["image"], "disparity") if kind == "depth" else (["target", "sources"], "T_source_target")
+        given = [dict(zip(inputs, example)) for example in examples]
+        graph = exported(network.eval(), [*given[0].values()], inputs, [output])
         content = _with_metadata(graph, kind, preset, model)
         difference = max(_difference(network, content, each) for each in given)
         if not difference <= TOLERANCE:
@@ -93,7 +91,7 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
                 f"{file} was not written: onnxruntime differs from PyTorch by {difference:.1e} of the largest output "
                 f"of {preset}, more than {TOLERANCE:.0e}; report the versions of torch, onnx and onnxruntime"
             )
-        write_atomically(file, lambda part, content=content: part.write_bytes(content))  # type: ignore[misc]
+        write_atomically(file, content)
         files.append(Exported(file, kind, preset, difference))
     return files
 

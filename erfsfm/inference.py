@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from ctypes.util import find_library
-from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from erfsfm.common.errors import CheckpointError, ConfigError, DataError
-from erfsfm.common.files import write_atomically
+from erfsfm.common.errors import CheckpointError, ConfigError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.common.readers.images import resize_image
 from erfsfm.common.readers.pinhole import MOST_PIXELS
 from erfsfm.common.threads import usable_cores
+from erfsfm.config import NetworkKind
 from erfsfm.model_record import ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.model_record import record_of_whole_weights as record_of_whole_weights
 from erfsfm.networks.onnx_graph import OnnxGraph
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
+    from torch import nn
+
     from erfsfm.checkpoint import Model
 
 _BFLOAT16 = ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16")  # capabilities of a processor
-F = TypeVar("F", np.float32, np.float64)
 Array = NDArray[np.float32]
 Device = Literal["cpu", "cuda"]
 Runtime = Literal["torch", "onnx"]
@@ -79,22 +79,11 @@ def _may_have_gpu() -> bool:
     return not version("torch").endswith("+cpu") and bool(has_driver or find_library("nvcuda"))
 
 
-@dataclass
-class PreparedImage:
-    """An image as a predictor's networks take it: resized, in [-1, 1], ``(1, 3, h, w)``."""
-
-    array: Array
-
-
-class _Networks(NamedTuple):
-    depth: Network
-    pose: Network
-
-
 @lru_cache(maxsize=1)
-def _graphs(folder: Path, sha256: str) -> _Networks:
+def _graphs(folder: Path, sha256: str) -> dict[NetworkKind, OnnxGraph]:
     """Of the weights with this digest, each made by PyTorch only where it is not kept on disk."""
-    network = read_record(folder / "model.yaml").network
+    record = read_record(folder / "model.yaml")
+    config = record.network
 
     @cache
     def model() -> Model:
@@ -102,11 +91,15 @@ def _graphs(folder: Path, sha256: str) -> _Networks:
 
         return load_model(folder)
 
-    depth = OnnxGraph(lambda: model().depth_net, NETWORK_THREADS, f"depth {sha256} {network!r}")
-    pose = OnnxGraph(lambda: model().pose_net, NETWORK_THREADS, f"pose {sha256} {network!r}")
-    if not depth.is_kept((1, 3, network.height, network.width)):
+    def network(kind: NetworkKind) -> nn.Module:
+        return model().networks[kind]
+
+    graphs = {
+        kind: OnnxGraph(partial(network, kind), NETWORK_THREADS, f"{kind} {sha256} {config!r}") for kind in record.kinds
+    }
+    if "depth" not in graphs or not graphs["depth"].is_kept((1, 3, config.height, config.width)):
         model()  # damaged weights are found before the first image
-    return _Networks(depth, pose)
+    return graphs
 
 
 class DepthPosePredictor:
@@ -114,7 +107,9 @@ class DepthPosePredictor:
 
     origin: str = "these weights"
 
-    def __init__(self, record: ModelRecord, networks: _Networks, device: Device, sha256: str = "") -> None:
+    def __init__(
+        self, record: ModelRecord, networks: Mapping[NetworkKind, Network], device: Device, sha256: str = ""
+    ) -> None:
         self.device = device
         self.record = record
         self.sha256 = sha256
@@ -131,7 +126,7 @@ class DepthPosePredictor:
         from erfsfm.networks.torch_network import TorchNetwork
 
         chosen = choose_device(device)
-        networks = _Networks(TorchNetwork(model.depth_net, chosen), TorchNetwork(model.pose_net, chosen))
+        networks = {kind: TorchNetwork(network, chosen) for kind, network in model.networks.items()}
         return cls(model.record, networks, chosen, sha256)
 
     @classmethod
@@ -179,27 +174,38 @@ class DepthPosePredictor:
         (height, width), size = image.shape[:2], self.record.depth_input
         if size is None:
             return depth_at(self.disparity(image), height, width)
-        seen = PreparedImage(self._input(image, size.height, size.width))
-        return depth_at(self.disparity(seen) * np.float32(size.disparity), height, width)
+        return depth_at(
+            self.disparity(_input(image, size.height, size.width)) * np.float32(size.disparity), height, width
+        )
 
-    def prepare(self, image: NDArray[np.uint8]) -> PreparedImage:
-        """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image."""
+    def prepare(self, image: NDArray[np.uint8] | Array) -> Array:
+        """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image.
+
+        Returns:
+            ``(1, 3, h, w)`` in [-1, 1] at the size of the training; an image that was prepared stays as it is.
+        """
+        if isinstance(image, np.ndarray) and image.ndim == 4 and image.dtype == np.float32:
+            return np.asarray(image, np.float32)
         network = self.record.network
-        return PreparedImage(self._input(image, network.height, network.width))
+        return _input(image, network.height, network.width)
 
-    def disparity(self, image: NDArray[np.uint8] | PreparedImage) -> NDArray[np.float32]:
+    def disparity(self, image: NDArray[np.uint8] | Array) -> NDArray[np.float32]:
         """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the size of the training, as of a snippet.
 
-        Raises:
-            CheckpointError: the network's output is not finite.
-        """
-        return self._finite(self._networks.depth(self._array(image))[0, 0], "depth")
+        Args:
+            image: the image, or what `prepare` made of it.
 
-    def poses(self, images: Sequence[NDArray[np.uint8] | PreparedImage]) -> NDArray[np.float64]:
+        Raises:
+            CheckpointError: there is no depth network, or its output is not finite.
+        """
+        return np.asarray(self._output("depth", self.prepare(image))[0])
+
+    def poses(self, images: Sequence[NDArray[np.uint8] | Array]) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
 
         Args:
-            images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle.
+            images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle, or what `prepare`
+                made of them.
 
         Returns:
             ``T_source_target`` ``(N, 4, 4)``, target camera to source camera, unscaled; row k belongs to
@@ -207,37 +213,37 @@ class DepthPosePredictor:
 
         Raises:
             ValueError: another number of images than the networks were trained for, or several sizes.
-            CheckpointError: the network's output is not finite.
+            CheckpointError: there is no pose network, or its output is not finite.
         """
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
-        if len(sizes := {image.shape for image in images if isinstance(image, np.ndarray)}) > 1:
+        if len(sizes := {image.shape for image in images if image.ndim == 3}) > 1:
             raise ValueError(f"images of a snippet must have one size; got {sorted(sizes)}")
         middle = self.sources // 2
-        inputs = [self._array(image) for image in images]
+        inputs = [self.prepare(image) for image in images]
         target = inputs.pop(middle)
-        vectors = self._finite(self._networks.pose(target, inputs)[0].astype(np.float64), "pose")
+        vectors = self._output("pose", target, inputs).astype(np.float64)
         T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
         T_source_target[:, :3, :3] = Rotation.from_euler("XYZ", vectors[:, 3:]).as_matrix()
         T_source_target[:, :3, 3] = vectors[:, :3]
         return T_source_target
 
-    def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
-        """The output of a network, refused where it is not finite: float16 weights may overflow in a forward pass."""
+    def _output(self, kind: NetworkKind, *inputs: Array | list[Array]) -> Array:
+        """Of a network for one input, refused where it is not finite: float16 weights may overflow in the pass."""
+        if kind not in self._networks:
+            raise CheckpointError(f"{self.origin} holds no {kind} network: use weights that have both")
+        output: Array = self._networks[kind](*inputs)[0]
         if not np.isfinite(output).all():
             raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
         return output
 
-    @staticmethod
-    def _input(image: NDArray[np.uint8], height: int, width: int) -> Array:
-        """An image at a network's size, in [-1, 1], ``(1, 3, height, width)``."""
-        require_image(image)
-        resized = resize_image(image, height, width)
-        scaled = resized.astype(np.float32) / np.float32(127.5) - np.float32(1)
-        return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
 
-    def _array(self, image: NDArray[np.uint8] | PreparedImage) -> Array:
-        return image.array if isinstance(image, PreparedImage) else self.prepare(image).array
+def _input(image: NDArray[np.uint8] | Array, height: int, width: int) -> Array:
+    """An image at a network's size, in [-1, 1], ``(1, 3, height, width)``."""
+    require_image(image)
+    resized = resize_image(np.asarray(image, np.uint8), height, width)
+    scaled = resized.astype(np.float32) / np.float32(127.5) - np.float32(1)
+    return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
 
 
 def require_image(image: object) -> None:
@@ -273,22 +279,3 @@ def colour_disparity(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
     low, high = np.percentile(disparity[is_known], [1, 98]) if is_known.any() else (0.0, 1.0)
     shade = np.clip((disparity - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
-
-
-def save_image(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an RGB image, whole or not at all."""
-    if path.suffix.lower() not in (".png", ".jpg"):
-        raise DataError(f"cannot write {path}: images are .png or .jpg")
-    require_image(image)
-    _, encoded = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]))
-    write_atomically(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
-
-
-def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
-    """Write a depth map as ``.npy``, whole or not at all."""
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.save(file, depth)
-
-    write_atomically(path, write)

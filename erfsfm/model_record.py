@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError, field_validator
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from erfsfm.common.config_tree import Section, YamlError, first_problem, read_yaml
+from erfsfm.common.config_tree import Section, read_model
 from erfsfm.common.errors import CheckpointError
-from erfsfm.config import NetworkConfig
+from erfsfm.config import NetworkConfig, NetworkKind
 
 FORMAT: Literal[1] = 1
 SHIPPED = Path(__file__).parent / "weights"
-FILES = ("depth.safetensors", "pose.safetensors")
+KINDS: tuple[NetworkKind, NetworkKind] = ("depth", "pose")
 
 
 class DepthInput(Section):
@@ -47,6 +48,11 @@ class ModelRecord(Section):
     commit: str = ""
     command: str = ""
 
+    @property
+    def kinds(self) -> tuple[NetworkKind, ...]:
+        """Of the networks that are there."""
+        return KINDS if self.networks == "both" else (self.networks,)
+
     @field_validator("network", mode="before")
     @classmethod
     def _known_keys(cls, network: Any) -> Any:
@@ -62,12 +68,7 @@ def read_record(path: Path) -> ModelRecord:
     Raises:
         CheckpointError: damaged, or of another format.
     """
-    try:
-        return ModelRecord.model_validate(read_yaml(path))
-    except YamlError as error:
-        raise CheckpointError(str(error)) from error
-    except ValidationError as error:
-        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {first_problem(error)}") from error
+    return read_model(ModelRecord, path, CheckpointError, f"is not a model record of format {FORMAT}")
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
@@ -87,6 +88,11 @@ def find_weights(name_or_folder: str | Path) -> Path:
     raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
 
 
+def tensors_file(folder: Path, kind: NetworkKind) -> Path:
+    """The weights of a network in a folder."""
+    return folder / f"{kind}.safetensors"
+
+
 def record_of_whole_weights(name_or_folder: str | Path) -> ModelRecord:
     """The record of weights whose tensors can be read and are finite, which needs no PyTorch.
 
@@ -95,20 +101,32 @@ def record_of_whole_weights(name_or_folder: str | Path) -> ModelRecord:
     """
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
-    for path in (folder / name for name in FILES if record.networks in ("both", Path(name).stem)):
-        try:
-            is_finite = all(np.isfinite(tensor).all() for tensor in load_file(path).values())
-        except (OSError, SafetensorError) as error:
-            raise CheckpointError(f"{path} is missing or damaged ({error}); copy the whole weights folder") from error
-        if not is_finite:
-            raise CheckpointError(f"{path} holds NaN or infinite values; use other weights")
+    for kind in record.kinds:
+        read_tensors(folder, kind)
     return record
+
+
+def read_tensors(folder: Path, kind: NetworkKind) -> dict[str, NDArray[Any]]:
+    """The weights of a network in a folder, by name.
+
+    Raises:
+        CheckpointError: missing, damaged, or not finite.
+    """
+    path = tensors_file(folder, kind)
+    try:
+        tensors: dict[str, NDArray[Any]] = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path} is damaged or missing ({error}); copy the whole weights folder") from error
+    for key, value in tensors.items():
+        if not np.isfinite(value).all():
+            raise CheckpointError(f"{path}: '{key}' holds NaN or infinite values: use other weights")
+    return tensors
 
 
 def weights_sha256(folder: Path) -> str:
     """SHA-256 of both weight files together, and of the alignment of poses, which changes what they give."""
     digest = hashlib.sha256()
-    for path in (folder / name for name in FILES):
+    for path in (tensors_file(folder, kind) for kind in KINDS):
         digest.update(path.read_bytes() if path.is_file() else b"")
     alignment = read_record(folder / "model.yaml").network.alignment
     digest.update(b"" if alignment == "none" else alignment.encode())

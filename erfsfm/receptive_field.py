@@ -5,7 +5,6 @@ The paper compares its networks by these fields (its figure 4).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,15 @@ from erfsfm.common.files import save_figure
 from erfsfm.common.table import Table
 from erfsfm.config import Fidelity
 from erfsfm.networks.presets import PRESETS, build
-from erfsfm.networks.receptive_field import MeasuredField, Network, effective, measured, theoretical, theoretical_corner
+from erfsfm.networks.receptive_field import (
+    MeasuredField,
+    Network,
+    field_of,
+    measured,
+    share_read,
+    theoretical,
+    theoretical_corner,
+)
 
 # Supports do not depend on the width; effective fields of untrained networks hardly do.
 _PROBE_WIDTH = 0.1
@@ -47,49 +54,18 @@ class FieldRow:
     """One network's fields, of the middle pixel of its last encoder layer.
 
     Attributes:
-        name: preset.
-        fidelity: ``paper`` or ``default``.
-        weights: name of the learned weights of `weighed`, or ``untrained``.
-        offsets_px: outward offset of deformable taps in `seen`, pixels; 0 for other networks.
-        side_px: theoretical side with taps moved by `offsets_px`.
-        side_at_rest_px: theoretical side at zero offsets.
-        corner: image row and column of the theoretical box, taps moved.
+        title: the network's name, marked where it is the paper's.
+        summary: the numbers by name, in pixels and fractions of the image, with taps pushed by ``offsets_px``.
+        corner: image row and column of the theoretical box, taps pushed.
         seen: support of the pixel's gradient, with constant weights.
-        union_share: fraction of the image in the support of any pixel of the layer.
         weighed: effective field on an image.
     """
 
-    name: str
-    fidelity: Fidelity
-    weights: str
-    offsets_px: float
-    side_px: int
-    side_at_rest_px: int
+    title: str
+    summary: dict[str, Any]
     corner: tuple[int, int]
     seen: MeasuredField
-    union_share: float
     weighed: MeasuredField
-
-    @property
-    def title(self) -> str:
-        """The network's name, marked where it is the paper's."""
-        return self.name + (" (paper)" if self.fidelity == "paper" else "")
-
-    def summary(self) -> dict[str, Any]:
-        """The numbers by name, in pixels and fractions of the image."""
-        return {
-            "name": self.name,
-            "fidelity": self.fidelity,
-            "offsets_px": self.offsets_px,
-            "theoretical_px": self.side_px,
-            "theoretical_at_rest_px": self.side_at_rest_px,
-            "rows": self.seen.rows,
-            "columns": self.seen.columns,
-            "share": self.seen.coverage,
-            "share_of_all_outputs": self.union_share,
-            "effective_share_95": self.weighed.share_holding(HELD),
-            "weights": self.weights,
-        }
 
 
 def measure_fields(
@@ -127,9 +103,11 @@ def field_table(rows: Sequence[FieldRow]) -> Table:
     """The summaries of rows."""
     texts = []
     for row in rows:
-        shares = (row.seen.coverage, row.union_share, row.weighed.share_holding(HELD))
+        numbers = row.summary
+        shares = (numbers[key] for key in ("share", "share_of_all_outputs", "effective_share_95"))
         box = f"{row.seen.columns} x {row.seen.rows}"
-        texts.append([row.title, row.weights, f"{row.side_px} px", box, *(f"{share:.1%}" for share in shares)])
+        start = [row.title, numbers["weights"], f"{numbers['theoretical_px']} px", box]
+        texts.append([*start, *(f"{share:.1%}" for share in shares)])
     head = ["network", "weights", "theory", "columns x rows", "share", "all outputs", "95 % in"]
     return Table(head, texts, names=2)
 
@@ -155,15 +133,15 @@ def draw_fields(rows: Sequence[FieldRow], image: NDArray[np.uint8], path: Path) 
 
 
 def _draw_seen(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
-    field = row.seen
+    field, side, offsets_px = row.seen, row.summary["theoretical_px"], row.summary["offsets_px"]
     read = field.gradient.cpu().numpy() > 0
     axis.imshow(np.where(read[..., None], image, (image * _DIM).astype(np.uint8)), interpolation="nearest")
-    boxes = [(*row.corner, row.side_px, row.side_px, _BOX, "--")]
+    boxes = [(*row.corner, side, side, _BOX, "--")]
     boxes += [(field.top, field.left, field.rows, field.columns, _MEASURED, "-")] if field.rows else []
     for top, left, rows, columns, colour, style in boxes:
         axis.add_patch(Rectangle((left - 0.5, top - 0.5), columns, rows, fill=False, edgecolor=colour, linestyle=style))
-    taps = f", taps pushed {row.offsets_px:g} px" if row.offsets_px else ""
-    said = f"{row.title}{taps}: {row.side_px} px in theory, box {field.columns} x {field.rows}"
+    taps = f", taps pushed {offsets_px:g} px" if offsets_px else ""
+    said = f"{row.title}{taps}: {side} px in theory, box {field.columns} x {field.rows}"
     axis.set_title(f"{said}, {field.coverage:.1%} of the image", fontsize=7.5, loc="left", pad=3)
 
 
@@ -172,9 +150,9 @@ def _draw_weighed(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
     axis.imshow(np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8), alpha=0.5)
     strength = np.sqrt(weight / max(weight.max(), 1e-30))
     axis.imshow(strength, cmap=_HEAT, alpha=np.clip(1.6 * strength, 0, 0.95), vmin=0, vmax=1)
-    ratio = row.weighed.share_holding(HELD)
+    ratio = row.summary["effective_share_95"]
     extent = f"{HELD:.0%} in {ratio:.1%} of the image" if ratio else "nothing: no pixel influences the output"
-    axis.set_title(f"weights: {row.weights}; {extent}", fontsize=7.5, loc="left", pad=3)
+    axis.set_title(f"weights: {row.summary['weights']}; {extent}", fontsize=7.5, loc="left", pad=3)
 
 
 def _row(
@@ -190,21 +168,23 @@ def _row(
     size = (height, width)
     pushed = offsets_px if any(layer.deformable for layer in probe.encoder.layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
-    outputs = itertools.product(range(seen.map_size[0]), range(seen.map_size[1]))
-    supports = [measured(probe, size, output, pushed).gradient > 0 for output in outputs]
     network, weights = _with_weights(name, fidelity, learned)
-    return FieldRow(
-        name,
-        fidelity,
-        weights,
-        pushed,
-        side_px=theoretical(probe, pushed),
-        side_at_rest_px=theoretical(probe),
-        corner=theoretical_corner(probe, seen.pixel, pushed),
-        seen=seen,
-        union_share=float(torch.stack(supports).any(dim=0).double().mean()),
-        weighed=effective(network.to(device), _encoder_input(snippet, network).to(device)),
-    )
+    weighed = field_of(network.encoder.eval().to(device), _encoder_input(snippet, network).to(device))
+    summary = {
+        "name": name,
+        "fidelity": fidelity,
+        "offsets_px": pushed,
+        "theoretical_px": theoretical(probe, pushed),
+        "theoretical_at_rest_px": theoretical(probe),
+        "rows": seen.rows,
+        "columns": seen.columns,
+        "share": seen.coverage,
+        "share_of_all_outputs": share_read(probe, size, pushed),
+        "effective_share_95": weighed.share_holding(HELD),
+        "weights": weights,
+    }
+    title = f"{name} (paper)" if fidelity == "paper" else name
+    return FieldRow(title, summary, theoretical_corner(probe, seen.pixel, pushed), seen, weighed)
 
 
 def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | None) -> tuple[Network, str]:
@@ -212,9 +192,8 @@ def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | No
     if learned is not None:
         title, model = learned
         config, kind = model.record.network, PRESETS[name].kind
-        trained = model.depth_net if kind == "depth" else model.pose_net
-        same = (config.depth if kind == "depth" else config.pose) == name and config.fidelity == fidelity
-        if same and isinstance(trained, Network):
+        trained = model.networks.get(kind)
+        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
             return trained, title
     return build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
 

@@ -15,7 +15,7 @@ import pytest
 import erfsfm
 import slam
 from erfsfm.config import load_experiment
-from erfsfm.data.split_file import read_split_file
+from erfsfm.data.split import read_split_file
 from slam.config.sections import load_config
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -28,8 +28,8 @@ from benchmarking import runs as p
 from benchmarking.metrics import rows
 from shared.command import one_line_errors, parser_of
 
+from erfsfm.common.files import write_atomically
 from erfsfm.common.table import csv_of
-from slam.runtime.storage.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Mode:
     """What a mode measures, and the defaults of its options."""
 
     what: str
-    configurations: tuple[p.Configuration, ...]
+    configurations: dict[str, tuple[str, ...]]
     routes: tuple[str, ...]
     worlds: tuple[int, ...] = (610,)
     weights: tuple[str, ...] = ("default",)
@@ -69,8 +69,7 @@ def main(words: Sequence[str] | None = None) -> None:
         raise SystemExit("nothing to measure: give --routes or a recording; see --help")
     results = p.measured(jobs, options.jobs, options.scheduler)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
-    content = csv_of(table_of_runs).encode()
-    write_atomically(options.output / f"{options.mode}.csv", lambda file: file.write_bytes(content))
+    write_atomically(options.output / f"{options.mode}.csv", csv_of(table_of_runs))
     text = page.section(options.mode, command, results, "several" if options.scheduler else str(options.jobs))
     _write_section(options, text)
     print(text)
@@ -88,7 +87,7 @@ def _write_section(options: argparse.Namespace, text: str) -> None:
             text = text.replace(written, name)
     report: Path = options.report
     old = report.read_text(encoding="utf-8") if report.is_file() else ""
-    write_atomically(report, lambda file: file.write_text(page.with_section(old, text), encoding="utf-8"))
+    write_atomically(report, page.with_section(old, text))
 
 
 def _compare_speed(options: argparse.Namespace, command: str) -> None:
@@ -130,18 +129,23 @@ def _jobs(options: argparse.Namespace) -> list[p.Job]:
     configurations = MODES[options.mode].configurations
     parts = getattr(options, "parts", None)
     if parts is not None:
-        configurations = tuple(c for c in configurations if c is p.EVERYTHING or c.name in parts)
-    rest = options.weights, options.seeds, options.set, options.device
-    return p.plan(folder, drives, configurations, *rest)
+        configurations = {name: configurations[name] for name in (p.EVERYTHING, *parts)}
+    return p.plan(folder, drives, configurations, options.weights, options.seeds, options.set, options.device)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__doc__)
     modes = parser.add_subparsers(dest="mode", required=True, metavar="|".join([*MODES, "speed"]))
+
+    def options_of(name: str, what: str) -> Callable[..., object]:
+        show = argparse.ArgumentDefaultsHelpFormatter
+        add = modes.add_parser(name, help=what, description=what, formatter_class=show).add_argument
+        add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
+        add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
+        return add
+
     for name, mode in MODES.items():
-        add = modes.add_parser(
-            name, help=mode.what, description=mode.what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-        ).add_argument
+        add = options_of(name, mode.what)
         if name == "full-size":
             data = os.environ.get("ERFSFM_DATA")
             add("--data", type=Path, default=data and Path(data), metavar="FOLDER", help="recordings; $ERFSFM_DATA")
@@ -150,45 +154,34 @@ def _parser() -> argparse.ArgumentParser:
             add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
         if name == "handheld":
             handheld.add_options(add)
-            add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
         else:
-            _add_worlds(add, mode)
+            add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
+            add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
+            add("--frames", type=int, default=300, help="their length")
+            add(
+                "--conditions", nargs="+", choices=get_args(p.Condition), default=["clean"], help="hazards: all at once"
+            )
+        add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
         add("--weights", nargs="+", default=mode.weights, help="names or folders")
         add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")
         add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
-        add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
-        add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
         if name in ("accuracy", "maps"):
             add("--excerpt", metavar="A:B", help="frames of the sequences of --kitti, half-open")
         if name == "maps":
             add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
-            parts = [each.name for each in mode.configurations if each is not p.EVERYTHING]
+            parts = [part for part in mode.configurations if part != p.EVERYTHING]
             add("--parts", nargs="*", choices=parts, metavar="PART", help=f"to turn off: {', '.join(parts)}; else all")
         add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")
         add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
-    what = "time, memory and stages of two checkouts in turn"
-    add = modes.add_parser(
-        "speed", help=what, description=what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-    ).add_argument
+    add = options_of("speed", "time, memory and stages of two checkouts in turn")
     add("--against", type=Path, required=True, metavar="CHECKOUT", help="the other checkout, run before this one")
     add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root, run with its map and without")
     add("--sequence", default="05", help="of that root")
     add("--folders", nargs="*", type=Path, default=(), metavar="FOLDER", help="folders of images")
     add("--frames", type=int, default=2000, help="of a simulated grid; 0 leaves it out")
     add("--pairs", type=int, default=3, help="runs of each drive by each checkout")
-    add("--output", type=Path, default=Path("runs/benchmark"), help="keeps the last runs and the world")
-    add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
     return parser
-
-
-def _add_worlds(add: Callable[..., object], mode: Mode) -> None:
-    """The options of simulated worlds."""
-    add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
-    add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
-    add("--frames", type=int, default=300, help="their length")
-    add("--conditions", nargs="+", choices=get_args(p.Condition), default=["clean"], help="hazards: all at once")
-    add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
 
 
 if __name__ == "__main__":

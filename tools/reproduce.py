@@ -18,7 +18,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ from erfsfm.common.progress import Progress, duration, progress_bar, silent
 from erfsfm.common.table import Table
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.prepared import write_prepared
-from erfsfm.data.snippets import split_recordings
+from erfsfm.data.split import split_recordings
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.evaluation.protocols import named_recordings, pose_protocol
 from erfsfm.inference import DepthPosePredictor
@@ -112,7 +111,7 @@ class Training:
             kept["pose"] = pose_protocol(predictor, kitti, TESTED, "paper", allow_leak=False)
         if "depth" not in kept and raw is not None:
             kept["depth"] = eigen_protocol(predictor, raw, split, "paper", allow_leak=True)
-        write_atomically(file, lambda path: path.write_text(json.dumps(kept, indent=2) + "\n"))
+        write_atomically(file, json.dumps(kept, indent=2) + "\n")
         return kept
 
 
@@ -193,7 +192,7 @@ def main(words: Sequence[str] | None = None) -> None:
                 training.run(options.device, progress)
             results[training.name] = training.evaluate(options.kitti, options.raw, options.split, options.device)
             text = tables(rows, results)
-            write_atomically(options.output / "tables.md", partial(Path.write_text, data=text, encoding="utf-8"))
+            write_atomically(options.output / "tables.md", text)
     print(text)
 
 

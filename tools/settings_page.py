@@ -6,14 +6,12 @@ Example: python tools/settings_page.py
 from __future__ import annotations
 
 import re
-import types
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any
 
 import yaml
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from shared.command import parser_of
 
 from erfsfm.common.files import write_atomically
@@ -35,8 +33,10 @@ TRAINING = """## Training
 Settings of `erfsfm train`. `configs/erfsfm/` holds complete experiments; `--config NAME` takes one of them.
 
 """
-WORDS = {str: "text", int: "integer", float: "number", bool: "true or false", Path: "path"}
-BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+# types, formats and bounds of a JSON schema
+WORDS = {"string": "text", "integer": "integer", "number": "number", "boolean": "true or false", "path": "path"}
+WORDS |= {"null": "null"}
+BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 HEADER = "| setting | values | default | meaning |\n|---|---|---|---|\n"
 
 
@@ -45,7 +45,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--output", type=Path, default=Path("docs/settings.md"), help="the page to write")
     output: Path = parser.parse_args().output
-    write_atomically(output, lambda path: path.write_text(page(), encoding="utf-8"))
+    write_atomically(output, page())
 
 
 def page() -> str:
@@ -56,16 +56,12 @@ def page() -> str:
 
 def sections(config: BaseModel) -> Iterator[str]:
     """A heading and a table for each section; the settings outside of sections come last."""
-    single = []
-    for name, declared in type(config).model_fields.items():
-        value = getattr(config, name)
+    for name, value in config:
         if isinstance(value, BaseModel):
-            rows = [row(f"{name}.{key}", field, value) for key, field in type(value).model_fields.items()]
-            yield f"### {name}\n{summary(value)}\n\n{HEADER}{''.join(rows)}"
-        else:
-            single.append(row(name, declared, config))
+            yield f"### {name}\n{summary(value)}\n\n{table(value, f'{name}.', list(type(value).model_fields))}"
+    single = [name for name, value in config if not isinstance(value, BaseModel)]
     if single:
-        yield f"### Outside of sections\n\n{HEADER}{''.join(single)}"
+        yield f"### Outside of sections\n\n{table(config, '', single)}"
 
 
 def summary(section: BaseModel) -> str:
@@ -74,33 +70,31 @@ def summary(section: BaseModel) -> str:
     return re.sub(r"`docs/([\w/-]+)\.md`", r"[\1](\1.md)", first)
 
 
-def row(key: str, field: FieldInfo, section: BaseModel) -> str:
-    """One line of a table."""
-    last = key.rpartition(".")[2]
-    default = yaml.safe_dump(section.model_dump(mode="json")[last], default_flow_style=True, width=10_000)
-    shown = default.removesuffix("...\n").strip()
-    limits = [(sign, getattr(limit, name, None)) for limit in field.metadata for name, sign in BOUNDS.items()]
-    bounds = [f"{sign} {number}" for sign, number in limits if number is not None]
-    values = ", ".join([kind(field.annotation), *bounds])
-    return f"| `{key}` | {values} | `{shown}` | {field.description} |\n"
+def table(section: BaseModel, prefix: str, keys: list[str]) -> str:
+    """A line for each of these settings of a section, by its JSON schema."""
+    schema, defaults = type(section).model_json_schema()["properties"], section.model_dump(mode="json")
+    text = HEADER
+    for key in keys:
+        default = yaml.safe_dump(defaults[key], default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+        limited = schema[key].get("anyOf", [schema[key]])[0]  # of an optional number
+        values = ", ".join([kind(schema[key]), *(f"{BOUNDS[b]} {limited[b]}" for b in BOUNDS if b in limited)])
+        text += f"| `{prefix}{key}` | {values} | `{default}` | {schema[key]['description']} |\n"
+    return text
 
 
-def kind(annotation: Any) -> str:
-    """The values of a type, in words."""
-    origin, inner = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        return kind(inner[0])
-    if origin is Literal:
-        return ", ".join(f"`{value}`" for value in inner)
-    if origin in (Union, types.UnionType):
-        return " or ".join("null" if part is type(None) else kind(part) for part in inner)
-    if origin is tuple:
-        return f"{len(inner)} values: {kind(inner[0])}"
-    if origin is list:
-        return f"list: {kind(inner[0])}"
-    if origin is dict:
-        return f"mapping: {kind(inner[0])} to {kind(inner[1])}"
-    return WORDS[annotation]
+def kind(schema: dict[str, Any]) -> str:
+    """The values of a JSON schema, in words."""
+    if "enum" in schema or "const" in schema:
+        return ", ".join(f"`{value}`" for value in schema.get("enum") or [schema["const"]])
+    if "anyOf" in schema:
+        return " or ".join(map(kind, schema["anyOf"]))
+    if "prefixItems" in schema:
+        return f"{len(schema['prefixItems'])} values: {kind(schema['prefixItems'][0])}"
+    if schema["type"] == "array":
+        return f"list: {kind(schema['items'])}"
+    if schema["type"] == "object":
+        return f"mapping: text to {kind(schema['additionalProperties'])}"
+    return WORDS[schema.get("format", schema["type"])]
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from shared.command import one_line_errors, parser_of
 from erfsfm.checkpoint import Model, load_model, save_model
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.table import table_of
-from erfsfm.model_record import FILES, SHIPPED
+from erfsfm.model_record import SHIPPED, tensors_file
 
 LARGEST_MB = 20
 
@@ -59,11 +59,13 @@ def main() -> None:
     model = averaged([load_model(each) for each in (arguments.run, *arguments.mean_with)])
     folder = SHIPPED / arguments.name
     record = model.record.model_copy(update={"command": arguments.command or model.record.command})
-    save_model(folder, Model(record, model.depth_net, model.pose_net), half=True)
-    for file in FILES:
-        size = (folder / file).stat().st_size / 1e6
+    save_model(folder, Model(record, model.networks), half=True)
+    for file in (tensors_file(folder, kind) for kind in record.kinds):
+        size = file.stat().st_size / 1e6
         if size > LARGEST_MB:
-            raise SystemExit(f"{file} has {size:.1f} MB; shipped weights have at most {LARGEST_MB}: train narrower")
+            raise SystemExit(
+                f"{file.name} has {size:.1f} MB; shipped weights have at most {LARGEST_MB}: train narrower"
+            )
     network = record.network
     card = CARD.format(
         name=arguments.name,
@@ -87,15 +89,15 @@ def main() -> None:
 def averaged(models: list[Model]) -> Model:
     """The first, whose networks have the mean of the weights of all (Wortsman et al. 2022, model soups)."""
     model = models[0]
-    for kind in ("depth_net", "pose_net"):
-        states = [getattr(each, kind).state_dict() for each in models]
+    for kind, network in model.networks.items():
+        states = [each.networks[kind].state_dict() for each in models]
         mean = {
             k: sum(each[k] for each in states) / len(states) if v.is_floating_point() else v
             for k, v in states[0].items()
         }
-        getattr(model, kind).load_state_dict(mean)
+        network.load_state_dict(mean)
     seen = merge([name for each in models for name in each.record.trained_on])
-    return Model(model.record.model_copy(update={"trained_on": seen}), model.depth_net, model.pose_net)
+    return Model(model.record.model_copy(update={"trained_on": seen}), model.networks)
 
 
 def _table(path: Path | None, fallback: dict[str, float]) -> str:

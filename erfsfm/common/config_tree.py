@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from erfsfm.common.errors import ConfigError
+from erfsfm.common.errors import ConfigError, ErfsfmError
 from erfsfm.common.files import read_text
 
 M = TypeVar("M", bound=BaseModel)
@@ -24,10 +24,7 @@ class Section(BaseModel):
 
 
 def load_config(
-    model: type[M],
-    file_or_name: str | Path | None,
-    overrides: Sequence[str],
-    shipped: Sequence[Path],
+    model: type[M], file_or_name: str | Path | None, overrides: Sequence[str], shipped: Sequence[Path]
 ) -> M:
     """Read a YAML file, or one of the ``shipped`` folders by its name; None for the defaults of the ``model``.
 
@@ -64,6 +61,16 @@ def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
     begun = [name for name in sorted(known) if name.startswith(path.stem)]  # "table1" is the beginning of many
     names = ", ".join(begun or (name for name in sorted(known) if "-" not in name))  # variants have a dash
     raise ConfigError(f"no configuration file or name '{file_or_name}' (known names: {names or 'none'}){hint}")
+
+
+def read_model(model: type[M], path: Path, error: type[ErfsfmError], wrong: str) -> M:
+    """A small YAML file that has no overrides; an ``error`` of one line says what is ``wrong`` with it."""
+    try:
+        return model.model_validate(read_yaml(path) or {})
+    except YamlError as problem:
+        raise error(str(problem)) from problem
+    except ValidationError as problem:
+        raise error(f"{path} {wrong}: {first_problem(problem)}") from problem
 
 
 def dump_yaml(config: BaseModel) -> str:

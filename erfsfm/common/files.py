@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from erfsfm.common.errors import BusyError, ConfigError, OneLineError
 
@@ -29,8 +29,8 @@ _FIGURE_METADATA: dict[str, dict[str, str | None]] = {
 FIGURE_SUFFIXES = tuple(_FIGURE_METADATA)
 
 
-def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = True) -> None:
-    """Let ``fill`` write a temporary file beside ``path``, then rename it; missing parent folders are made.
+def write_atomically(path: Path, content: str | bytes | Callable[[Path], object], sync: bool = True) -> None:
+    """Write ``content``, or let it write, a temporary file beside ``path``, then rename it; missing folders are made.
 
     The temporary name ends as ``path`` does, for writers that look at the suffix. With ``sync`` the disk holds the
     content before it gets its name; a disk that fills up late is found then.
@@ -45,7 +45,10 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
     partial = path.with_name(f".{os.getpid()}.{threading.get_ident()}.partial.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        fill(partial)
+        if callable(content):
+            content(partial)
+        else:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
         if sync:
             with partial.open("r+b") as file:
                 os.fsync(file.fileno())
@@ -55,6 +58,16 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def write_array(path: Path, save: Callable[[BinaryIO], None], sync: bool = True) -> None:
+    """As `write_atomically`, by a function of NumPy, which would add a suffix to a path."""
+
+    def fill(partial: Path) -> None:
+        with partial.open("wb") as file:
+            save(file)
+
+    write_atomically(path, fill, sync)
 
 
 def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) -> None:

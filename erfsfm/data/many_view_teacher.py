@@ -13,14 +13,13 @@ from concurrent.futures import as_completed
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import BinaryIO, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
-from erfsfm.common.files import FolderLock, write_atomically
+from erfsfm.common.files import FolderLock, write_array, write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
@@ -43,7 +42,6 @@ LEAST_NEIGHBOURS = 2
 _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
 
-Measures = Literal["depth and poses", "poses"]
 Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]  # least and most inverse depth (H, W)
 Learned = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
 
@@ -108,7 +106,7 @@ class DriveLabels:
             frames = VideoFrames(video.path, counted_frames=0)
             images = (frames.read(recording.start + index) for index in range(len(recording)))
         T_world_camera = drive_poses(recording.frames_name, images, recording.camera, weights)
-        write_atomically(self.weights_file, lambda path: path.write_text(weights))
+        write_atomically(self.weights_file, weights)
         self.keep_poses(T_world_camera)
 
     def require_weights(self, weights: str) -> None:
@@ -123,7 +121,7 @@ class DriveLabels:
 
     def keep_poses(self, T_world_camera: NDArray[np.float64]) -> None:
         """Write the poses ``(N, 4, 4)`` of all frames."""
-        _write(self.poses_file, lambda file: np.save(file, T_world_camera))
+        write_array(self.poses_file, partial(np.save, arr=T_world_camera))
 
     def measure_labels(self, targets: Sequence[int], learned: Learned | None = None) -> int:
         """Measure and keep the labels of some frames; returns their number.
@@ -141,7 +139,7 @@ class DriveLabels:
                 for values in bounds
             )
             arrays = {"least": least, "most": most}
-            _write(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
+            write_array(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
         return len(targets)
 
     def _bounds(self, target: int, learned: Learned | None) -> Bounds | None:
@@ -198,7 +196,7 @@ class ManyViewTeacher:
         size: height and width of the labels.
         stride: every how many frames there is one.
         cache_mb: memory for labels that were read.
-        measures: with ``poses`` alone there are no labels, every frame may be a target, and no depth is bounded.
+        with_depth: else there are no labels, every frame may be a target, and no depth is bounded.
         learned: depth of an image, which is refined; it has to be one that processes can be given.
     """
 
@@ -208,14 +206,14 @@ class ManyViewTeacher:
         size: tuple[int, int],
         stride: int,
         cache_mb: int = 0,
-        measures: Measures = "depth and poses",
+        with_depth: bool = True,
         learned: Learned | None = None,
     ) -> None:
-        self.measures = measures
+        self._with_depth = with_depth
         self._learned = learned
         self._folder = folder
         self._size = size
-        self._stride = stride if measures == "depth and poses" else 1
+        self._stride = stride if with_depth else 1
         self._labels = ArrayCache(cache_mb, (2, *size), np.float16)
         self._drives: dict[tuple[str, Path], DriveLabels] = {}
 
@@ -233,7 +231,7 @@ class ManyViewTeacher:
         """Of the snippet that begins at a frame."""
         drive, target = self.drive(recording), first + sources // 2
         motion = snippet_motion(drive.T_world_camera, first, sources).astype(np.float32)
-        if self.measures == "poses":
+        if not self._with_depth:
             return TeacherStructure(motion, np.zeros(self._size, np.float16), np.full(self._size, np.inf, np.float16))
         least, most = self._labels.get((*recording.key, target), lambda: np.stack(drive.label(target)))
         return TeacherStructure(motion, least, most)
@@ -251,7 +249,7 @@ class ManyViewTeacher:
             for drive in drives:
                 drive.require_weights(weights)
             without = [drive for drive in drives if not drive.poses_file.is_file()]
-            tasks = [] if self.measures == "poses" else [each for drive in drives for each in _missing(drive, sources)]
+            tasks = [each for drive in drives for each in _missing(drive, sources)] if self._with_depth else []
             for drive in (*without, *(drive for drive, _ in tasks)):
                 if drive.compact:
                     raise TrainingError(
@@ -289,14 +287,6 @@ def _missing(drive: DriveLabels, sources: int) -> list[tuple[DriveLabels, list[i
 
 def _grey(image: NDArray[np.uint8]) -> Grey:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
-def _write(path: Path, save: Callable[[BinaryIO], None], sync: bool = True) -> None:
-    def fill(part: Path) -> None:
-        with part.open("wb") as file:  # given a path, NumPy would add a suffix
-            save(file)
-
-    write_atomically(path, fill, sync)
 
 
 SMALLEST = 0.002  # inverse depth of code 0, one over camera heights: 800 m; code 255 is 0.7 m

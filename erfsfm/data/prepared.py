@@ -7,7 +7,6 @@ record the same training data.
 
 from __future__ import annotations
 
-import logging
 import os
 import shutil
 from collections.abc import Sequence
@@ -17,18 +16,17 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from erfsfm.common.config_tree import Section, YamlError, dump_yaml, first_problem, read_yaml
+from erfsfm.common.config_tree import Section, dump_yaml, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress
+from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import NetworkConfig
 from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher, encode
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import Snippet
 from erfsfm.geometry.camera import Camera
-
-logger = logging.getLogger(__name__)
 
 INDEX_FILE = "prepared.yaml"
 _POSES, _LABELS = "poses.txt", "labels"  # of a recording: true poses of its camera (KITTI), and the teacher's
@@ -59,12 +57,7 @@ def _file(folder: Path, kind: Literal["images", "depth"], frame: int) -> Path:
 
 def read_prepared(root: Path) -> list[Recording]:
     """The recordings of a prepared folder; ``DataError`` where its index is damaged."""
-    try:
-        index = _Index.model_validate(read_yaml(root / INDEX_FILE))
-    except YamlError as error:
-        raise DataError(str(error)) from error
-    except ValidationError as error:
-        raise DataError(f"{root / INDEX_FILE} is damaged: {first_problem(error)}; prepare again") from error
+    index = read_model(_Index, root / INDEX_FILE, DataError, "is damaged, prepare again")
     return [_recording(root / f"{number:04d}", entry) for number, entry in enumerate(index.recordings)]
 
 
@@ -105,11 +98,7 @@ def write_prepared(
                     _put(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]))
             elif teacher is not None:
                 _write_labels(teacher.drive(recording), folder / _LABELS, network)
-        total = sum(map(len, recordings))
-        if len(unreadable) == total:
-            raise DataError(f"none of {total} images can be read: {unreadable[0]}")
-        if unreadable:
-            logger.warning("%d of %d images cannot be read and are left out: %s", len(unreadable), total, unreadable[0])
+        report_unreadable(unreadable, sum(map(len, recordings)), "images")
         entries = _Index(recordings=[_entry(recording, network) for recording in recordings])
         (unfinished / INDEX_FILE).write_text(dump_yaml(entries))
         unfinished.replace(output)

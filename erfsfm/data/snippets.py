@@ -6,7 +6,6 @@ augmentation. A run resumed at step k therefore draws the same samples as an uni
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -16,24 +15,15 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
-from erfsfm.data.discovery import discover
 from erfsfm.data.exact_depth import ExactLabels, by_label, depth_mb
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, depth_alone, single_image, training_sample
-from erfsfm.data.split_file import Split, read_split_file
-from erfsfm.data.standstill import moving_parts
+from erfsfm.data.split import usable
 from erfsfm.data.window import Snippet, TeacherStructure, first_readable, load_window, readable, snippet_motion
 from erfsfm.geometry.camera import Camera
-
-logger = logging.getLogger(__name__)
-
-_SHORTEST_STOP = 10  # frames of an own recording
-_SHORTEST_END = 20  # frames: fewer give neither a trajectory with its scale nor depth by many views
-_DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
@@ -177,149 +167,6 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 def labels_mb(config: DataConfig) -> int:
     """The part of ``data.cache_mb`` for labels of many views: larger than images, but fewer."""
     return config.cache_mb * 2 // 5
-
-
-def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
-    """Recordings that hold at least one snippet; ``DataError`` where none does."""
-    kept = [r for r in recordings if len(r) >= length]
-    if not kept:
-        raise DataError(f"a snippet needs {length} consecutive frames; found {_lengths(recordings) or 'no recording'}")
-    return kept
-
-
-def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
-    """Training and validation recordings of all roots, by the configuration's split, ranges and exclusions."""
-    if not config.roots:
-        raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
-    split = read_split_file(config.split) if config.split else Split()
-    left_out = read_split_file(config.leave_out).test_recordings if config.leave_out != "none" else []
-    scenes = [FrameRange.parse(name) for name in left_out]
-    ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
-    listed = [FrameRange.parse(name) for name in split.train]
-    held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
-    never = [FrameRange.parse(name) for name in (*config.exclude, *split.test_recordings)]
-    unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
-    if unknown:
-        raise DataError(f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}")
-    found = [recording for root in config.roots for recording in discover(root)]
-    for key, span in zip(config.ranges, ranges):
-        if all(span.counted_in(recording.name) is None for recording in found):
-            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {_names(found)}")
-    _require_begun(found, [*ranges, *listed, *held_out])
-    training: list[Recording] = []
-    validation: list[Recording] = []
-    for recording in found:
-        validation += _parts(recording, held_out)
-        forbidden = [*held_out, *never, *(scenes if recording.name.startswith("kitti_raw/") else [])]
-        for part in _chosen(recording, ranges, listed):
-            training += _rest(part, forbidden)
-    if not training:
-        raise DataError(
-            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used to validate or "
-            "test; see data.exclude, data.validation, data.split and data.leave_out"
-        )
-    if config.validation_share > 0:
-        training, ends = _ends_split_off(training, config.validation_share)
-        validation += ends
-    if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
-        wanted = _some([*config.validation, *split.validation])
-        raise DataError(
-            f"nothing to validate on: data.validation and data.split name {wanted}; found {_names(found)}; name one of "
-            "these, or train without validation by data.validation=[]"
-        )
-    named = config.validation if config.validation != _DEFAULT_VALIDATION else []
-    absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
-    if absent:
-        logger.warning("data.validation names %s, which is not among the data", _some(absent))
-    return _without_stops(training, config), _without_stops(validation, config)
-
-
-def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
-    """The recordings without their last parts, and these."""
-    kept, ends = [], []
-    for recording in recordings:
-        cut = round((1 - share) * len(recording))
-        is_long = len(recording) - cut >= _SHORTEST_END
-        kept.append(recording.part(0, cut) if is_long else recording)
-        ends += [recording.part(cut, len(recording))] if is_long else []
-    if not ends:
-        raise DataError(
-            f"nothing to validate on: data.validation_share {share:g} leaves fewer than {_SHORTEST_END} frames of "
-            f"{_lengths(recordings)}: give longer recordings or a larger share"
-        )
-    return kept, ends
-
-
-def _lengths(recordings: Sequence[Recording]) -> str:
-    return _some([f"{recording.name} ({len(recording)} frames)" for recording in recordings])
-
-
-def _names(recordings: Sequence[Recording]) -> str:
-    return _some([recording.name for recording in recordings])
-
-
-def _some(names: Sequence[str]) -> str:
-    """Names for an error: each once, and the first few of many."""
-    distinct = list(dict.fromkeys(names))
-    return ", ".join(distinct[:8]) + (f" and {len(distinct) - 8} more" if len(distinct) > 8 else "")
-
-
-def _chosen(recording: Recording, ranges: Sequence[FrameRange], listed: Sequence[FrameRange]) -> list[Recording]:
-    """What to train on of a recording: its ranges, else what the split lists of it, else all where there is no list."""
-    for candidates in (ranges, listed):
-        if any(frames.counted_in(recording.name) is not None for frames in candidates):
-            return _parts(recording, candidates)
-    return [] if listed else [recording]
-
-
-def _parts(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
-    """The parts of a recording that frame ranges name."""
-    same = [frames.counted_in(recording.name) for frames in ranges]
-    parts = [recording.within(frames.start, frames.stop) for frames in same if frames is not None]
-    return [part for part in parts if part is not None]
-
-
-def _rest(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
-    """The parts of a recording before, between and after frame ranges."""
-    rest = [recording]
-    for frames in (each.counted_in(recording.name) for each in ranges):
-        if frames is not None:
-            sides = [(part.within(0, frames.start), part.within(frames.stop, EVERYTHING)) for part in rest]
-            rest = [part for pair in sides for part in pair if part is not None]
-    return rest
-
-
-def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> None:
-    """Refuse frame ranges that begin after the last frame of the recording they name."""
-    for each in ranges:
-        same = [(recording, each.counted_in(recording.name)) for recording in found]
-        named = [(recording.start + len(recording), frames) for recording, frames in same if frames is not None]
-        if named and all(frames.start >= end for end, frames in named):
-            end, frames = max(named, key=lambda pair: pair[0])
-            raise DataError(f"{frames} begins after the {end} frames that the recording has")
-
-
-def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
-    """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
-    if config.static_frames == "keep":
-        return recordings
-    kept = [part for recording in recordings for part in _moving(recording)]
-    before = sum(map(len, recordings))
-    if (lost := before - sum(map(len, kept))) > 0:
-        logger.info("left out %d of %d frames in which the camera stands still", lost, before)
-    if recordings and not kept:
-        raise DataError("the camera stands still in every frame found: data.static_frames=keep trains on them")
-    return kept
-
-
-def _moving(recording: Recording) -> list[Recording]:
-    """A doubled frame of an own video is no stop, and its drive stays whole for the teacher."""
-    kind, _, _ = recording.name.partition("/")
-    if recording.without_stops or kind not in ("kitti_raw", "folder") or recording.exact:
-        return [recording]
-    if kind == "kitti_raw":
-        return moving_parts(recording)
-    return [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= min(_SHORTEST_END, len(recording))]
 
 
 def _require_known(recordings: Sequence[Recording], weights: Mapping[str, float]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import report_unreadable
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.recordings import Recording
 
@@ -88,11 +89,5 @@ def readable(snippets: list[Snippet], read: Callable[[Snippet], object]) -> list
             kept.append(snippet)
         except DataError as error:
             reasons.append(str(error))
-    if reasons and not kept:
-        raise DataError(f"no snippet to validate on can be read: {reasons[0]}")
-    if reasons:
-        total, left_out = len(snippets), len(reasons)
-        logger.warning(
-            "%d of %d snippets to validate on cannot be read and are left out: %s", left_out, total, reasons[0]
-        )
+    report_unreadable(reasons, len(snippets), "snippets to validate on")
     return kept

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,24 +15,18 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.images import read_image, resize_image
 from erfsfm.config import Fidelity
-from erfsfm.data.split_file import read_split_file
+from erfsfm.data.split import read_split_file
 from erfsfm.evaluation.depth_metrics import CAP_M, DepthErrors, depth_errors, mean_errors
-from erfsfm.evaluation.protocols import PoseDepthNetworks, refuse_leak
+from erfsfm.evaluation.protocols import refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
-from erfsfm.model_record import ModelRecord
+from erfsfm.inference import DepthPosePredictor
 
 _STILL_M = 0.1
 _FLAT_ROAD_M = 20.0
 
 
-class RawNetworks(PoseDepthNetworks, Protocol):
-    """Networks with their record: this protocol needs the size of their images."""
-
-    record: ModelRecord
-
-
 def read_split(split: str, root: Path) -> list[RawFrame]:
-    """The frames to test on of a shipped split or a YAML file (`erfsfm.data.split_file`), or those of a list.
+    """The frames to test on of a shipped split or a YAML file (`erfsfm.data.split`), or those of a list.
 
     Args:
         split: ``eigen``, a file of the list ``test``, or any other file with a frame a line.
@@ -60,7 +54,7 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
 
 
 def eigen_protocol(
-    networks: RawNetworks, root: Path, split: str, fidelity: Fidelity, allow_leak: bool
+    networks: DepthPosePredictor, root: Path, split: str, fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
     """Errors under 80 m in the crop of Garg et al., scaled by the medians and by the car's own speed.
 
@@ -111,7 +105,7 @@ def _root_of_dates(root: Path) -> Path:
     return root.parent if (root / "calib_cam_to_cam.txt").is_file() else root
 
 
-def _depth(networks: RawNetworks, image: NDArray[np.uint8], fidelity: Fidelity) -> NDArray[np.float32]:
+def _depth(networks: DepthPosePredictor, image: NDArray[np.uint8], fidelity: Fidelity) -> NDArray[np.float32]:
     """Unscaled depth at the image's size."""
     if fidelity == "default":
         return networks.depth(image)
@@ -128,7 +122,7 @@ def _compare(
     return depth_errors(guess, truth, CAP_M, crop="garg", scaling=scaling, clipping=clipping)
 
 
-def _scale_of_motion(networks: RawNetworks, frame: RawFrame, fidelity: Fidelity) -> float | None:
+def _scale_of_motion(networks: DepthPosePredictor, frame: RawFrame, fidelity: Fidelity) -> float | None:
     """Mean of true over predicted distance to the sources; None for a still car, except in paper fidelity."""
     window = frame.window(networks.sources)
     true = displacements(frame, window)

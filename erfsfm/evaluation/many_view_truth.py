@@ -16,7 +16,9 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
-from erfsfm.evaluation.protocols import PoseDepthNetworks, named_recordings, refuse_leak
+from erfsfm.evaluation.protocols import named_recordings, refuse_leak
+from erfsfm.evaluation.streets import EVERY
+from erfsfm.inference import DepthPosePredictor
 
 CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
 LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
@@ -26,13 +28,12 @@ _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: th
 
 
 def many_view_protocol(
-    networks: PoseDepthNetworks,
+    networks: DepthPosePredictor,
     root: Path,
     sequences: Sequence[str],
     cache: Path | None,
     allow_leak: bool,
     progress: Progress,
-    every: int = 5,
 ) -> list[dict[str, Any]]:
     """Median-scaled depth errors where the many-view teacher knows the depth within ``LARGEST_RATIO``.
 
@@ -46,7 +47,6 @@ def many_view_protocol(
         cache: receives poses and depth, for the next call; forgotten where None.
         allow_leak: evaluate also frames that the networks were trained on.
         progress: told of the stage, what is done, and of how many.
-        every: distance of the frames that are compared.
 
     Returns:
         One row for each recording; ``known`` is the share of pixels that were compared.
@@ -57,16 +57,11 @@ def many_view_protocol(
     """
     recordings = [each for name in sequences for each in named_recordings(root, name)] or discover(root)
     with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:
-        return many_view_errors(networks, recordings, cache or Path(folder), allow_leak, progress, every)
+        return many_view_errors(networks, recordings, cache or Path(folder), allow_leak, progress)
 
 
 def many_view_errors(
-    networks: PoseDepthNetworks,
-    recordings: Sequence[Recording],
-    cache: Path,
-    allow_leak: bool,
-    progress: Progress,
-    every: int = 5,
+    networks: DepthPosePredictor, recordings: Sequence[Recording], cache: Path, allow_leak: bool, progress: Progress
 ) -> list[dict[str, Any]]:
     """`many_view_protocol` of recordings."""
     leaks = [refuse_leak(networks, [each.frames_name], allow_leak) for each in recordings]
@@ -75,7 +70,7 @@ def many_view_errors(
         width, height = recording.camera.width, recording.camera.height
         ratio = min(1.0, LARGEST_WIDTH / width)
         # the teacher's labels are measured around a network's depth, and truth without any
-        teacher = ManyViewTeacher(cache / TRUTH_FOLDER, (round(height * ratio), round(width * ratio)), every)
+        teacher = ManyViewTeacher(cache / TRUTH_FOLDER, (round(height * ratio), round(width * ratio)), EVERY)
         teacher.prepare([recording], networks.sources, SLAM_WEIGHTS, progress)
         errors, known = _compare(networks, recording, teacher)
         if not errors:
@@ -88,7 +83,7 @@ def many_view_errors(
 
 
 def _compare(
-    networks: PoseDepthNetworks, recording: Recording, teacher: ManyViewTeacher
+    networks: DepthPosePredictor, recording: Recording, teacher: ManyViewTeacher
 ) -> tuple[list[DepthErrors], list[float]]:
     """Errors, and the share of known pixels, of each frame that has any."""
     drive = teacher.drive(recording)

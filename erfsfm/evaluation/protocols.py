@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,41 +19,17 @@ from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.evaluation.depth_metrics import (
-    CAP_M,
-    DepthErrors,
-    depth_errors,
-    mean_errors,
-    mean_ratio,
-    standard_error,
-)
+from erfsfm.evaluation.depth_metrics import CAP_M, DepthErrors, depth_errors, mean_errors, mean_ratio, standard_error
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
 from erfsfm.evaluation.streets import Street, find_streets
+from erfsfm.inference import DepthPosePredictor
 
 _BASELINE = "median depth map"
 _PICTURE_WIDTH = 620
 
 
-class PoseDepthNetworks(Protocol):
-    """Depth and pose networks as evaluations use them (``erfsfm.inference.DepthPosePredictor``)."""
-
-    sources: int
-
-    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Unscaled z-depth ``(H, W)``."""
-        ...
-
-    def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
-        """``T_source_target`` ``(N, 4, 4)``."""
-        ...
-
-    def leaks(self, names: Sequence[str]) -> list[str]:
-        """Recordings that were trained on."""
-        ...
-
-
 def depth_protocol(
-    networks: Mapping[str, PoseDepthNetworks],
+    networks: Mapping[str, DepthPosePredictor],
     roots: Sequence[Path],
     allow_leak: bool,
     progress: Progress = silent,
@@ -99,7 +74,7 @@ def depth_protocol(
             if to_draw is not None and compared:
                 scaled = [guesses[name] * np.float32(compared[name].scale) for name in networks]
                 jpeg, file = _picture(image, scaled, truth), f"{street.name.replace('/', '-')}.jpg"
-                write_atomically(to_draw / file, partial(Path.write_bytes, data=jpeg))
+                write_atomically(to_draw / file, jpeg)
                 to_draw = None
             done += 1
         if not all(errors[name][place] for name in networks):
@@ -108,7 +83,7 @@ def depth_protocol(
 
 
 def _depth_rows(
-    networks: Mapping[str, PoseDepthNetworks],
+    networks: Mapping[str, DepthPosePredictor],
     streets: Sequence[Street],
     errors: Mapping[str, list[list[DepthErrors]]],
     leaks: Mapping[str, list[bool]],
@@ -142,7 +117,7 @@ def _picture(image: NDArray[np.uint8], depths: Iterable[NDArray[np.float32]], tr
 
 
 def pose_protocol(
-    networks: PoseDepthNetworks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
+    networks: DepthPosePredictor, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
     """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and
     constant velocity straight ahead.
@@ -223,7 +198,7 @@ def _depth_row(method: str, streets: list[list[DepthErrors]], before: list[list[
     return row | {"images": len(scales), "streets": len(streets)}
 
 
-def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: bool) -> bool:
+def refuse_leak(networks: DepthPosePredictor, names: Sequence[str], allow_leak: bool) -> bool:
     """Whether some of the frames were trained on; ``DataError`` where that was not allowed."""
     leaked = networks.leaks(names)
     if leaked and not allow_leak:

@@ -21,17 +21,16 @@ LARGEST_STEP = 0.3  # radians, or units of length, in one iteration
 NEAREST = 0.1  # of a point's depth after the motion over that before
 
 
-def cell_rays(rows: int, columns: int, cell: tuple[float, float], device: torch.device) -> Tensor:
-    """Viewing rays ``(rows * columns, 3)`` of the cells' centres, with z = 1.
+def cell_rays(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Viewing rays ``(rows * columns, 3)`` of the centres of the cells that an image is divided into, with z = 1.
 
     Args:
         rows: of a feature map.
         columns: of a feature map.
-        cell: height and width of a cell over those of the image.
         device: of the rays.
     """
-    y = ((torch.arange(rows, device=device) + 0.5) * cell[0] - CENTRE[1]) / FOCAL[1]
-    x = ((torch.arange(columns, device=device) + 0.5) * cell[1] - CENTRE[0]) / FOCAL[0]
+    y = ((torch.arange(rows, device=device) + 0.5) * (1 / rows) - CENTRE[1]) / FOCAL[1]
+    x = ((torch.arange(columns, device=device) + 0.5) * (1 / columns) - CENTRE[0]) / FOCAL[0]
     x, y = x.repeat(rows), y.repeat_interleave(columns)
     return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 

@@ -30,10 +30,7 @@ SKY_INVERSE_DEPTH = 1 / 60  # of a camera height: the sky is farther than 100 m
 
 
 def label(
-    target: Grey,
-    neighbours: Sequence[Grey],
-    K: NDArray[np.floating],
-    T_neighbour_target: NDArray[np.float64],
+    target: Grey, neighbours: Sequence[Grey], K: NDArray[np.floating], T_neighbour_target: NDArray[np.float64]
 ) -> tuple[Array, Array]:
     """Least and most inverse depth of each pixel ``(H, W)``, in one over camera heights; 0 and infinite if unknown.
 

@@ -58,11 +58,7 @@ class UpBlock(nn.Sequential):
     """
 
     def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        kernel: Literal[3, 4],
-        normalisation: Normalisation = "none",
+        self, in_channels: int, out_channels: int, kernel: Literal[3, 4], normalisation: Normalisation = "none"
     ) -> None:
         convolution = nn.ConvTranspose2d(
             in_channels, out_channels, kernel, stride=2, padding=1, output_padding=4 - kernel

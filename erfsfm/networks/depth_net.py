@@ -52,7 +52,6 @@ class DisparityNetwork(nn.Module):
 
     input_channels = 3  # of the encoder
     encoder: Encoder
-    fidelity: Fidelity
 
     def decode(self, image: Tensor, stages: list[Tensor]) -> list[Tensor]:
         """Disparities, finest first, from the outputs of the encoder's stages; in evaluation mode one suffices."""
@@ -92,8 +91,7 @@ class DepthNet(DisparityNetwork):
         normalisation: Normalisation = "none",
     ) -> None:
         super().__init__()
-        self.variant = variant
-        self.fidelity = fidelity
+        self._runs = (variant, fidelity) != ("dilated", "paper")
         encoder = [scaled(channels, width) for channels in _ENCODER_CHANNELS]
         decoder = [scaled(channels, width) for channels in _DECODER_CHANNELS]
         stages = []
@@ -127,7 +125,7 @@ class DepthNet(DisparityNetwork):
         Raises:
             ConfigError: for the dilated network in paper fidelity, which fits no image.
         """
-        if self.variant == "dilated" and self.fidelity == "paper":
+        if not self._runs:
             raise ConfigError("erf-depthnet-dilated cannot run in paper fidelity: its maps shrink; use 'default'")
         return super().forward(image)
 

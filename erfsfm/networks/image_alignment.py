@@ -91,7 +91,7 @@ def _rotations(images: Tensor, R: Tensor, t: Tensor) -> Tensor:
     size = (int(images.shape[-2]), int(images.shape[-1]))  # constants in an exported graph
     flow, information = _followed(_levels(images), _guess(R, t, size))
     h, w = flow.shape[-2:]
-    rays = cell_rays(h, w, (1 / h, 1 / w), images.device)
+    rays = cell_rays(h, w, images.device)
     scale = torch.tensor([FOCAL[0] * size[1], FOCAL[1] * size[0]], device=images.device)
     seen = rays[:, :2] + flow.flatten(2).transpose(1, 2) / scale
     weights = information.flatten(2).transpose(1, 2) * scale**2
@@ -104,7 +104,7 @@ def _rotations(images: Tensor, R: Tensor, t: Tensor) -> Tensor:
 def _guess(R: Tensor, t: Tensor, size: tuple[int, int]) -> Tensor:
     """Flow ``(B, 2, h, w)`` in pixels of the image on the cells of the coarsest level, by guessed motions."""
     h, w = (pixels // 2 ** _LEVELS[0].halvings // _LEVELS[0].stride for pixels in size)
-    rays = cell_rays(h, w, (1 / h, 1 / w), R.device)
+    rays = cell_rays(h, w, R.device)
     _, at, _ = project(rays, _road(rays).expand(len(R), -1), R, t)
     pixels = torch.tensor([FOCAL[0] * size[1], FOCAL[1] * size[0]], device=R.device)
     return ((at - rays[:, :2]) * pixels).transpose(1, 2).reshape(len(R), 2, h, w)

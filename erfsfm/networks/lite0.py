@@ -169,10 +169,10 @@ class Lite0DepthNet(DisparityNetwork):
     start as plain ones.
     """
 
+    encoder: Lite0Encoder
+
     def __init__(self, variant: Variant = "plain", width: float = 1.0) -> None:
         super().__init__()
-        self.variant = variant
-        self.fidelity = "default"
         channels = [scaled(count, width) for count in _DECODER_CHANNELS]
         deformable = variant == "dfc"
         wide = Layer(3, 1, deformable=deformable)

@@ -39,13 +39,13 @@ class OnnxGraph:
     minutes to make.
     """
 
-    def __init__(self, network: Callable[[], nn.Module], threads: int, identity: str = "") -> None:
+    def __init__(self, network: Callable[[], nn.Module], threads: int, identity: str) -> None:
         """Prepare.
 
         Args:
             network: gives it in evaluation mode, with one output; not called where its graph is kept.
             threads: to run on.
-            identity: of the network with its weights, by which the graph is kept on disk; empty: it is not.
+            identity: of the network with its weights, by which the graph is kept on disk.
         """
         self._network = network
         self._threads = threads
@@ -61,13 +61,13 @@ class OnnxGraph:
 
     def is_kept(self, *shapes: tuple[int, ...]) -> bool:
         """Whether there is a graph for inputs of these shapes on disk."""
-        return bool(self._identity) and is_kept(self._key(shapes))
+        return _path(self._key(shapes)).is_file()
 
     def _key(self, shapes: Sequence[tuple[int, ...]]) -> str:
         return f"{self._identity} {list(shapes)}"
 
     def _chosen(self, key: str, *inputs: Array | list[Array]) -> Callable[..., Array]:
-        graph = kept(key) if self._identity else None
+        graph = kept(key)
         if graph is None:
             from erfsfm.networks.deformable import has_large_sampling
             from erfsfm.networks.torch_network import TorchNetwork, exported, tensors
@@ -76,8 +76,7 @@ class OnnxGraph:
             if has_large_sampling(network, *example):
                 return TorchNetwork(network, "cpu")
             graph = exported(network, example)
-            if self._identity:
-                keep(key, graph)
+            keep(key, graph)
         return partial(_run, open_session(graph, self._threads))
 
 
@@ -95,11 +94,6 @@ def folder() -> Path:
     """Beside torch's own downloads, so that ``TORCH_HOME`` and ``XDG_CACHE_HOME`` move it."""
     caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(os.environ.get("TORCH_HOME") or Path(caches, "torch")).expanduser().with_name("erfsfm")
-
-
-def is_kept(made_from: str) -> bool:
-    """Whether there is a file of this graph."""
-    return _path(made_from).is_file()
 
 
 def kept(made_from: str) -> bytes | None:
@@ -122,7 +116,7 @@ def keep(made_from: str, graph: bytes) -> None:
     """Write an ONNX file and delete the least recently used ones. A folder that cannot be written costs time only."""
     content = hashlib.sha256(graph).digest() + graph
     try:
-        write_atomically(_path(made_from), lambda partial: partial.write_bytes(content), sync=False)
+        write_atomically(_path(made_from), content, sync=False)
         for old in sorted(folder().glob("*.onnx"), key=lambda file: file.stat().st_mtime)[:-_MOST_GRAPHS]:
             old.unlink()
     except OSError as error:

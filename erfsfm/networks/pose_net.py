@@ -5,16 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from erfsfm.networks.blocks import (
-    ConvBlock,
-    Encoder,
-    Fidelity,
-    Layer,
-    Normalisation,
-    Variant,
-    initialise,
-    scaled,
-)
+from erfsfm.networks.blocks import ConvBlock, Encoder, Fidelity, Layer, Normalisation, Variant, initialise, scaled
 from erfsfm.networks.image_alignment import Alignment, aligned
 
 POSE_SCALE = 0.01
@@ -47,22 +38,12 @@ class PoseNet(nn.Module):
         alignment: Alignment = "none",
     ) -> None:
         super().__init__()
-        self.variant = variant
-        self.fidelity = fidelity
         self.sources = sources
         self.alignment = alignment
         channels = [scaled(count, width) for count in _ENCODER_CHANNELS]
         self.encoder = Encoder(
             [
-                [
-                    ConvBlock(
-                        inside,
-                        outside,
-                        _stage_layer(stage, kernel, variant, fidelity),
-                        fidelity,
-                        normalisation,
-                    )
-                ]
+                [ConvBlock(inside, outside, _stage_layer(stage, kernel, variant, fidelity), fidelity, normalisation)]
                 for stage, (kernel, inside, outside) in enumerate(
                     zip(_KERNELS, [self.input_channels, *channels], channels)
                 )

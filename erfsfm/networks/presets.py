@@ -7,14 +7,13 @@ from typing import Any, Literal, get_args
 import torch
 
 from erfsfm.common.errors import ConfigError
+from erfsfm.config import NetworkKind
 from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.image_alignment import Alignment
 from erfsfm.networks.lite0 import Lite0DepthNet
 from erfsfm.networks.pose_net import PoseNet
 from erfsfm.networks.receptive_field import Network, multiply_adds, theoretical
-
-NetworkKind = Literal["depth", "pose"]
 
 
 @dataclass(frozen=True)
@@ -65,12 +64,10 @@ def build(
         ConfigError: if the name or an option is unknown or out of range.
     """
     preset = _find(name)
-    _check_choice("fidelity", fidelity, get_args(Fidelity))
-    _check_choice("normalisation", normalisation, get_args(Normalisation))
-    _check_choice("alignment", alignment, get_args(Alignment))
+    if fidelity not in get_args(Fidelity):
+        raise ConfigError(f"fidelity must be one of {', '.join(get_args(Fidelity))}; got '{fidelity}'")
     if not 0 < width <= 8:
         raise ConfigError(f"width must be above 0 and at most 8; got {width}")
-    _check_choice("activation", activation, get_args(Activation))
     network: Network
     if preset.encoder == "lite0":
         if fidelity == "paper":
@@ -116,8 +113,3 @@ def _find(name: str) -> Preset:
     close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
     hint = f" (did you mean '{close[0]}'?)" if close else ""
     raise ConfigError(f"unknown network '{name}'{hint}; known: {', '.join(PRESETS)}")
-
-
-def _check_choice(option: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ConfigError(f"{option} must be one of {', '.join(choices)}; got '{value}'")

@@ -30,7 +30,9 @@ class MeasuredField:
     Attributes:
         pixel: (row, column) of the output pixel in the last encoder layer.
         map_size: (height, width) of that layer.
-        top: first image row with a gradient; so are `left`, and `bottom`, `right` the last ones.
+        top: first image row with a gradient; so is `left` the first column.
+        rows: height of the bounding box, 0 for an empty field.
+        columns: width of it.
         coverage: fraction of the image's pixels with a gradient.
         gradient: gradient magnitude summed over the input channels, ``(H, W)``.
     """
@@ -38,21 +40,11 @@ class MeasuredField:
     pixel: tuple[int, int]
     map_size: tuple[int, int]
     top: int
-    bottom: int
     left: int
-    right: int
+    rows: int
+    columns: int
     coverage: float
     gradient: Tensor
-
-    @property
-    def rows(self) -> int:
-        """Height of the bounding box, 0 for an empty field."""
-        return self.bottom - self.top + 1
-
-    @property
-    def columns(self) -> int:
-        """Width of the bounding box, 0 for an empty field."""
-        return self.right - self.left + 1
 
     def share_holding(self, weight: float) -> float:
         """Least fraction of the image's pixels that holds this fraction of the gradient; 0 for an empty field."""
@@ -109,14 +101,9 @@ def _jumps(layers: Sequence[Layer]) -> list[int]:
 
 
 def measured(
-    network: Network,
-    size: tuple[int, int] = (128, 416),
-    pixel: tuple[int, int] | None = None,
-    offsets_px: float = 0.0,
+    network: Network, size: tuple[int, int] = (128, 416), pixel: tuple[int, int] | None = None, offsets_px: float = 0.0
 ) -> MeasuredField:
     """Bounding box and coverage by input gradients, with constant positive weights and a white image.
-
-    Weights are one over the fan-in, so that no activation overflows; the given network is not changed.
 
     Args:
         network: any depth or pose network.
@@ -124,6 +111,22 @@ def measured(
         pixel: (row, column) of the observed output; its map's centre if None.
         offsets_px: how far deformable taps are pushed outwards from the kernel's centre, along both
             axes, in pixels of the layer's input.
+    """
+    return field_of(*_evenly_weighted(network, size, offsets_px), pixel, _ROUNDING)
+
+
+def share_read(network: Network, size: tuple[int, int], offsets_px: float = 0.0) -> float:
+    """Fraction of the image's pixels in the field of any output of the last encoder layer; arguments as `measured`."""
+    encoder, image = _evenly_weighted(network, size, offsets_px)
+    image.requires_grad_()
+    (gradient,) = torch.autograd.grad(encoder(image)[-1].sum(), image)  # of positive terms: none cancel
+    return float((gradient > 0).any(dim=1).double().mean())
+
+
+def _evenly_weighted(network: Network, size: tuple[int, int], offsets_px: float) -> tuple[Encoder, Tensor]:
+    """A copy of the encoder with constant positive weights, and a white image for it.
+
+    Weights are one over the fan-in, so that no activation overflows.
     """
     encoder = copy.deepcopy(network.encoder).double().eval()
     for module in encoder.modules():
@@ -138,39 +141,21 @@ def measured(
             nn.init.constant_(module.weight, 1 / module.weight[0].numel())
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
-    image = torch.ones(1, network.input_channels, *size, dtype=torch.float64)
-    return field_of(encoder, image.to(next(encoder.parameters()).device), pixel, _ROUNDING)
-
-
-def effective(network: Network, image: Tensor, pixel: tuple[int, int] | None = None) -> MeasuredField:
-    """Gradient-weighted field of the network as it is, its weights and offsets included (Luo et al. 2016).
-
-    Args:
-        network: any depth or pose network.
-        image: the encoder's input, ``(1, C, H, W)``; for a pose network target and sources stacked.
-        pixel: (row, column) of the observed output; its map's centre if None.
-    """
-    training = network.encoder.training
-    network.encoder.eval()
-    try:
-        return field_of(network.encoder, image, pixel)
-    finally:
-        network.encoder.train(training)
+    device = next(encoder.parameters()).device
+    return encoder, torch.ones(1, network.input_channels, *size, dtype=torch.float64, device=device)
 
 
 def field_of(
-    encoder: Encoder,
-    image: Tensor,
-    pixel: tuple[int, int] | None = None,
-    rounding: float = 0.0,
+    encoder: Encoder, image: Tensor, pixel: tuple[int, int] | None = None, rounding: float = 0.0
 ) -> MeasuredField:
     """Field of one pixel of an encoder's output, by input gradients of the sum of its channels.
 
-    All channels, since a single one may be zero behind its ReLU.
+    All channels, since a single one may be zero behind its ReLU. Of an encoder as it is, its weights and offsets
+    included, this is the gradient-weighted effective field (Luo et al. 2016).
 
     Args:
-        encoder: the encoder as it is.
-        image: its input, ``(1, C, H, W)``.
+        encoder: in evaluation mode.
+        image: its input, ``(1, C, H, W)``; of a pose network target and sources stacked.
         pixel: (row, column) of the observed output; its map's centre if None.
         rounding: ratio to the largest gradient up to which a gradient counts as zero.
     """
@@ -183,10 +168,10 @@ def field_of(
     (gradient,) = torch.autograd.grad(output[0, :, row, column].sum(), image)
     gradient = gradient[0].abs().sum(dim=0)  # (H, W)
     seen = gradient > rounding * gradient.max()
-    top, bottom = _extent(seen.any(dim=1))
-    left, right = _extent(seen.any(dim=0))
+    top, rows = _extent(seen.any(dim=1))
+    left, columns = _extent(seen.any(dim=0))
     coverage = float(seen.double().mean())
-    return MeasuredField((row, column), map_size, top, bottom, left, right, coverage, gradient)
+    return MeasuredField((row, column), map_size, top, left, rows, columns, coverage, gradient)
 
 
 def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
@@ -223,6 +208,6 @@ def _set_offsets(encoder: Encoder, offsets_px: float) -> set[nn.Module]:
 
 
 def _extent(seen: Tensor) -> tuple[int, int]:
-    """First and last true place; (0, -1) if there is none."""
+    """First true place, and how many there are up to the last; zeros if there is none."""
     places = seen.nonzero()[:, 0]
-    return (int(places[0]), int(places[-1])) if len(places) else (0, -1)
+    return (int(places[0]), int(places[-1] - places[0]) + 1) if len(places) else (0, 0)

@@ -84,9 +84,9 @@ def train_fusion(
     net.eval()
     metrics = _fit_sigma(net, held_out)
     graph = exported(net, [torch.zeros(1, CHANNELS, STEP, STEP)], ["evidence"], ["change", "log_sigma"], (2, 3))
-    write_atomically(output / FILE, lambda path: path.write_bytes(graph))
+    write_atomically(output / FILE, graph)
     record = {"command": command, "weights": weights, "samples": samples, "steps": steps, "seed": seed, **metrics}
-    write_atomically(output / RECORD, lambda path: path.write_text(json.dumps(record, indent=2) + "\n"))
+    write_atomically(output / RECORD, json.dumps(record, indent=2) + "\n")
     return metrics
 
 

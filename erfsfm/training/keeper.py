@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import Callback, WeightAveraging
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 import erfsfm
-from erfsfm.checkpoint import KINDS, Absent, Model, save_model
+from erfsfm.checkpoint import Model, save_model
 from erfsfm.common.errors import TrainingError
 from erfsfm.common.progress import Progress, duration
 from erfsfm.common.readers.frame_range import merge
@@ -143,10 +143,7 @@ class WeightKeeper(Callback):
             commit=commit(),
             command=self._command,
         )
-        depth_net, pose_net = (
-            module.network(kind) if module.known in ("both", kind) else Absent(kind, self._output) for kind in KINDS
-        )
-        return Model(record, depth_net, pose_net)
+        return Model(record, {kind: module.network(kind) for kind in record.kinds})
 
     def _measures(self, metrics: dict[str, float]) -> dict[Path, float]:
         """The metric by which each folder's weights are chosen; less is better."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Self
 
 import lightning
@@ -13,18 +13,16 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
 from erfsfm.common.errors import TrainingError
-from erfsfm.config import ExperimentConfig, TrainedNetworks
+from erfsfm.config import ExperimentConfig, NetworkKind, TrainedNetworks
 from erfsfm.data.samples import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
-from erfsfm.geometry.transforms import pose_vector_to_matrix, project_into_source, sample
-from erfsfm.losses.photometric import photometric_error
+from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
 from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
-from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
-from erfsfm.networks.presets import NetworkKind
-from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
+from erfsfm.networks.lite0 import Lite0Conv, Lite0DepthNet
+from erfsfm.training.objective import Level, ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -44,7 +42,7 @@ class SelfSupervision(lightning.LightningModule):
         super().__init__()
         self.config = config
         self._clock = clock
-        self.depth_net, self.pose_net = build_networks(config.network)
+        self.depth_net, self.pose_net = build_networks(config.network).values()
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self.depth_input: DepthInput | None = None  # of the network that this training goes on with
         self._choose_trained()
@@ -59,27 +57,23 @@ class SelfSupervision(lightning.LightningModule):
         training = self.config.training
         self.depth_net.requires_grad_(training.networks != "pose")
         self.pose_net.requires_grad_(training.networks != "depth")
-        for network in (self.depth_net, self.pose_net):
-            encoder = getattr(network, "encoder", None)
-            if isinstance(encoder, Lite0Encoder):
-                encoder.freeze(training.frozen_stages)
-                # depthwise convolutions are a quarter faster so
-                network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if isinstance(self.depth_net, Lite0DepthNet):
+            self.depth_net.encoder.freeze(training.frozen_stages)
+            # depthwise convolutions are a quarter faster so
+            self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def network(self, kind: NetworkKind) -> nn.Module:
         """The network of that kind."""
         return self.depth_net if kind == "depth" else self.pose_net
 
-    def take_imagenet(self, kinds: Sequence[NetworkKind]) -> None:
-        """Start the pretrained encoders of these networks from ImageNet's weights.
+    def take_imagenet(self) -> None:
+        """Start the encoder of a lite0 network from ImageNet's weights.
 
         Raises:
             ConfigError: they are not installed.
         """
-        for kind in kinds:
-            encoder = getattr(self.network(kind), "encoder", None)
-            if isinstance(encoder, Lite0Encoder):
-                encoder.take_imagenet()
+        if isinstance(self.depth_net, Lite0DepthNet):
+            self.depth_net.encoder.take_imagenet()
 
     def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
         """Colour to [0, 1] where the networks are."""
@@ -272,10 +266,6 @@ def learning_rate_factor(schedule: str, progress: float, step: int = _WARM_UP) -
 
 def _reconstruction_error(batch: dict[str, Tensor], disparity: Tensor, T_source_target: Tensor) -> float:
     """Mean over pixels of the smallest error among the sources (0.85 SSIM), whatever the training loss is."""
-    count = T_source_target.shape[1]
-    depth = (1 / disparity).repeat_interleave(count, dim=0)
-    projection = project_into_source(depth, T_source_target.flatten(0, 1), batch["K"].repeat_interleave(count, 0))
-    warped = sample(batch["sources"].flatten(0, 1), projection)
-    error = photometric_error(batch["target"].repeat_interleave(count, 0), warped, 0.85)
-    error = error.masked_fill(~projection.valid, torch.inf).unflatten(0, (-1, count)).amin(dim=1)
+    errors, valid = Level(batch["target"], batch["sources"], batch["K"], disparity).errors(T_source_target, 0.85)
+    error = errors.masked_fill(~valid, torch.inf).amin(dim=1)
     return float(error[torch.isfinite(error)].mean())

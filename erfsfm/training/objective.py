@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.data.window import HEIGHTS
 from erfsfm.geometry.camera import scale_intrinsics
-from erfsfm.geometry.transforms import Projection, pose_vector_to_matrix, project_into_source, sample
+from erfsfm.geometry.transforms import pose_vector_to_matrix, project_into_source, sample
 from erfsfm.losses.photometric import edge_aware_smoothness, photometric_error, second_order_smoothness
 from erfsfm.losses.structure import (
     Bounds,
@@ -58,15 +58,11 @@ class SnippetBatch:
 
 @dataclass(frozen=True)
 class ObjectiveResult:
-    """The loss, its terms, and the networks' outputs.
-
-    ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(S, N, 4, 4)``.
-    """
+    """The loss, its terms, and the depth network's outputs: ``disparities`` finest first, each ``(B, 1, h, w)``."""
 
     total: Tensor
     terms: dict[str, Tensor]
     disparities: list[Tensor]
-    T_source_target: Tensor
 
 
 def to_network_range(image: Tensor) -> Tensor:
@@ -88,35 +84,21 @@ def evaluate_objective(
         batch: images and intrinsics.
         config: its ``loss``, ``network`` and ``teacher`` sections are used.
     """
-    prediction = _Prediction.of(depth_net, pose_net, batch, config)
+    precise = batch.target.dtype
+    target, sources = batch.seen()
+    of_snippets = target[len(target) - len(batch.sources) :]
+    disparities: list[Tensor] = []
+    if needs_depth(config):
+        if not depth_net.training:
+            raise ValueError("the objective needs the depth network in training mode")
+        disparities = [disparity.to(precise) for disparity in depth_net(target)]
+    pose_vectors = target.new_zeros(len(of_snippets), len(sources), 6)
+    if needs_poses(config):
+        pose_vectors = pose_net(of_snippets, sources).to(precise)
     device = batch.target.device.type
     has_autocast = torch.amp.is_autocast_available(device)  # `meta` has none
     with torch.autocast(device, enabled=False) if has_autocast else nullcontext():
-        return _evaluate(prediction, batch, config)
-
-
-@dataclass(frozen=True)
-class _Prediction:
-    """Outputs of the networks in the images' precision."""
-
-    disparities: list[Tensor]
-    pose_vectors: Tensor
-
-    @staticmethod
-    def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
-        precise = batch.target.dtype
-        target, sources = batch.seen()
-        of_snippets = target[len(target) - len(batch.sources) :]
-        disparities: list[Tensor] = []
-        if needs_depth(config):
-            if not depth_net.training:
-                raise ValueError("the objective needs the depth network in training mode")
-            disparities = [disparity.to(precise) for disparity in depth_net(target)]
-        if needs_poses(config):
-            pose_vectors = pose_net(of_snippets, sources)
-        else:
-            pose_vectors = target.new_zeros(len(of_snippets), len(sources), 6)
-        return _Prediction(disparities, pose_vectors.to(precise))
+        return _evaluate(disparities, pose_vector_to_matrix(pose_vectors), batch, config)
 
 
 def needs_depth(config: ExperimentConfig) -> bool:
@@ -135,8 +117,10 @@ def needs_poses(config: ExperimentConfig) -> bool:
     return warps or (by_teacher and config.training.networks != "depth")
 
 
-def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> ObjectiveResult:
-    T_source_target = pose_vector_to_matrix(prediction.pose_vectors)
+def _evaluate(
+    disparities: list[Tensor], T_source_target: Tensor, batch: SnippetBatch, config: ExperimentConfig
+) -> ObjectiveResult:
+    """The loss of the networks' outputs, disparities ``(B, 1, h, w)`` and poses ``(S, N, 4, 4)``."""
     loss = config.loss
     T_warp = T_source_target
     if config.teacher.gives_motion and batch.T_source_target is not None:
@@ -144,40 +128,35 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
         T_warp[..., :3, 3] /= HEIGHTS
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     snippets = batch.snippets()
-    for level in range(loss.scales if prediction.disparities and len(snippets.target) > 0 else 0):
-        scale = _Level.of(snippets, prediction.disparities[level][-len(snippets.target) :], config)
+    for level in range(loss.scales if disparities and len(snippets.target) > 0 else 0):
+        scale = Level.of(snippets, disparities[level][-len(snippets.target) :], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
-            warped, projection = scale.warp(T_warp)
-            photometric = photometric + scale.photometric(warped, projection.valid, loss)
+            photometric = photometric + scale.photometric(T_warp, loss)
     if config.network.fidelity == "paper":
         photometric = 2 * photometric  # the reference compares images in [-1, 1]
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if batch.bounds is not None:
-        teacher_terms = _teacher_terms(prediction, T_source_target, batch.T_source_target, batch.bounds, config)
+        teacher_terms = _teacher_terms(disparities, T_source_target, batch, batch.bounds, config)
         terms |= teacher_terms
         for name, weight in config.teacher.weights.items():
             total = total + weight * teacher_terms.get(name, total.new_zeros(()))
-    return ObjectiveResult(total, terms, prediction.disparities, T_source_target)
+    return ObjectiveResult(total, terms, disparities)
 
 
 def _teacher_terms(
-    prediction: _Prediction,
-    T_source_target: Tensor,
-    T_measured: Tensor | None,
-    bounds: Bounds,
-    config: ExperimentConfig,
+    disparities: list[Tensor], T_source_target: Tensor, batch: SnippetBatch, bounds: Bounds, config: ExperimentConfig
 ) -> dict[str, Tensor]:
     """Loss terms of the teacher's labels."""
     terms: dict[str, Tensor] = {}
-    disparities = prediction.disparities
     if disparities:
         height, width = bounds.least.shape[-2:]
         levels = [enlarged(disparities[k], k, (height, width)) for k in range(config.loss.scales)]
         terms["structure"] = torch.stack([disagreement(level, bounds, math.log(HEIGHTS)) for level in levels]).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)
+    T_measured = batch.T_source_target
     if needs_poses(config) and T_measured is not None:
         terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
         terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], T_measured[..., :3, 3] / HEIGHTS)
@@ -185,7 +164,7 @@ def _teacher_terms(
 
 
 @dataclass(frozen=True)
-class _Level:
+class Level:
     """One level of the image pyramid with its disparity."""
 
     target: Tensor  # (B, 3, h, w)
@@ -194,33 +173,35 @@ class _Level:
     disparity: Tensor  # (B, 1, h, w)
 
     @staticmethod
-    def of(batch: SnippetBatch, disparity: Tensor, config: ExperimentConfig) -> _Level:
+    def of(batch: SnippetBatch, disparity: Tensor, config: ExperimentConfig) -> Level:
+        """Of a batch whose images are shrunk to the size of the disparity."""
         size = (disparity.shape[-2], disparity.shape[-1])
         full = (batch.target.shape[-2], batch.target.shape[-1])
         if size == full:
-            return _Level(batch.target, batch.sources, batch.K, disparity)
+            return Level(batch.target, batch.sources, batch.K, disparity)
         sources = F.interpolate(batch.sources.flatten(0, 1), size=size, mode="area")
-        return _Level(
+        return Level(
             F.interpolate(batch.target, size=size, mode="area"),
             sources.reshape(*batch.sources.shape[:3], *size),
             scale_intrinsics(batch.K, size, full, config.network.fidelity),
             disparity,
         )
 
-    def warp(self, T_source_target: Tensor) -> tuple[Tensor, Projection]:
-        """All sources warped to the target, ``(B * N, 3, h, w)``, and the projection."""
+    def errors(self, T_source_target: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
+        """Photometric errors of all sources warped to the target, and where they are seen, ``(B, N, h, w)`` each."""
         count = self.sources.shape[1]
         depth = (1 / self.disparity).repeat_interleave(count, dim=0)  # (B*N, 1, h, w)
         K = self.K.repeat_interleave(count, dim=0)
         projection = project_into_source(depth, T_source_target.flatten(0, 1), K)
-        return sample(self.sources.flatten(0, 1), projection), projection
-
-    def photometric(self, warped: Tensor, valid: Tensor, loss: LossConfig) -> Tensor:
-        count = self.sources.shape[1]
-        target = self.target.repeat_interleave(count, dim=0)
-        error = photometric_error(target, warped, loss.ssim_weight)  # (B*N, 1, h, w)
+        warped = sample(self.sources.flatten(0, 1), projection)
+        error = photometric_error(self.target.repeat_interleave(count, dim=0), warped, ssim_weight)
         shape = (len(self.target), count, *error.shape[-2:])
-        error, valid = error.reshape(shape), valid.reshape(shape)
+        return error.reshape(shape), projection.valid.reshape(shape)
+
+    def photometric(self, T_source_target: Tensor, loss: LossConfig) -> Tensor:
+        """Their mean over pixels, reduced over sources as the loss wants it."""
+        error, valid = self.errors(T_source_target, loss.ssim_weight)
+        count = self.sources.shape[1]
         still: Tensor | None = None
         if loss.auto_mask:
             with torch.no_grad():
@@ -243,6 +224,7 @@ class _Level:
         return best.masked_fill(~counted, 0).sum() / counted.sum().clamp(min=1)
 
     def smoothness(self, loss: LossConfig) -> Tensor:
+        """Of depth, or of disparity."""
         if loss.smoothness == "depth-second-order":
             return second_order_smoothness(1 / self.disparity)
         return edge_aware_smoothness(self.disparity, self.target)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
+from erfsfm.checkpoint import read_torch
 from erfsfm.common.errors import ConfigError, TrainingError
 from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
@@ -67,20 +66,15 @@ class OutputFolder:
 
     def write_config(self, config: ExperimentConfig) -> None:
         """Write the complete configuration of the run."""
-        write_atomically(self.path / CONFIG, lambda path: path.write_text(dump_yaml(config)))
+        write_atomically(self.path / CONFIG, dump_yaml(config))
 
 
 def _steps_of(checkpoint: Path) -> int:
-    """Steps done at a checkpoint. Only tensors and plain values are read: no code in it can run."""
-    try:
-        state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        missing = {"global_step", "state_dict", "optimizer_states", "loops", "known"} - set(state)
-        if missing:
-            raise KeyError(*sorted(missing))
-        if {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
-            raise KeyError("depth_net")
-        return int(state["global_step"])
-    except MemoryError:
-        raise
-    except Exception as error:  # a damaged file makes PyTorch raise anything, failed assertions too
-        raise TrainingError(f"{checkpoint} is damaged or no checkpoint: start again in another --output") from error
+    """Steps done at a checkpoint."""
+    wrong = "is damaged or no checkpoint: start again in another --output"
+    state = read_torch(checkpoint, TrainingError, wrong)
+    wanted = {"global_step", "state_dict", "optimizer_states", "loops", "known"}
+    is_whole = isinstance(state, dict) and wanted <= state.keys()
+    if not is_whole or {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
+        raise TrainingError(f"{checkpoint} {wrong}")
+    return int(state["global_step"])

@@ -24,7 +24,7 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from erfsfm.checkpoint import KINDS, load_model, take_over
+from erfsfm.checkpoint import load_model, take_over
 from erfsfm.common.errors import ConfigError
 from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.progress import Progress, silent
@@ -32,10 +32,11 @@ from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import opencv_threads
 from erfsfm.config import ExperimentConfig, Precision
-from erfsfm.data.exact_depth import by_label, stacked
+from erfsfm.data.exact_depth import stacked
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
+from erfsfm.data.split import split_recordings, usable
 from erfsfm.evaluation.many_view_truth import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
 from erfsfm.training.keeper import StepProgress, WeightKeeper
@@ -125,10 +126,9 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
         raise ConfigError("--prepare keeps whole recordings to validate on: set data.validation_share=0")
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
-    _, measured = by_label(training, config)
     held_out = ValidationSnippets(validation, config).snippets if validation else []
     with tempfile.TemporaryDirectory() as temporary:
-        teacher = measured_views(measured, config, config.teacher.cache or Path(temporary), progress)
+        teacher = measured_views(training, config, config.teacher.cache or Path(temporary), progress)
         write_prepared(output, training, held_out, teacher, config.network, progress)
 
 
@@ -161,8 +161,7 @@ def _draws(
     """What this process trains on; ``position``: steps done and rank."""
     done_steps, rank = position
     together = config.training.batch * config.training.devices
-    _, measured = by_label(training, config)
-    views = measured_views(measured, config, config.teacher.cache or output / MEASUREMENTS, progress)
+    views = measured_views(training, config, config.teacher.cache or output / MEASUREMENTS, progress)
     last, done = config.training.steps * together, done_steps * together
     return SnippetDraws(training, config, last, done, rank, views, imitated(config))
 
@@ -174,7 +173,6 @@ def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> 
         config.training.batch,
         num_workers=workers,
         pin_memory=pin_memory,
-        worker_init_fn=_single_threaded_worker,
         collate_fn=stacked,
         persistent_workers=workers > 0,
     )
@@ -212,23 +210,22 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
     """Load initial weights, also of another variant; returns what they were trained on."""
     name, wanted = config.initial_weights, config.network
     model = load_model(name) if name else None
-    loaded = [kind for kind in KINDS if model is not None and model.record.networks in ("both", kind)]
+    loaded = {} if model is None else model.networks
     if config.training.networks == "depth" and "pose" not in loaded and needs_poses(config):
         raise ConfigError(
             "training.networks: depth warps images by the motion of a pose network that was trained before, and there "
             "is none: name weights that have one as initial_weights, or set teacher.views=many, or "
             "loss.photometric_weight=0"
         )
-    if config.pretrained == "imagenet":
-        module.take_imagenet([kind for kind in KINDS if kind not in loaded])
+    if config.pretrained == "imagenet" and "depth" not in loaded:
+        module.take_imagenet()
     if model is None:
         return []
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "alignment")}
     try:
         if model.record.network.model_copy(update=free) != wanted:
             raise ConfigError("only presets and alignment may differ")
-        for kind in loaded:
-            trained = model.depth_net if kind == "depth" else model.pose_net
+        for kind, trained in loaded.items():
             take_over(module.network(kind), trained.state_dict())
     except ConfigError as error:
         raise ConfigError(f"initial_weights '{name}' are of another network: {error}") from error
@@ -301,9 +298,4 @@ class AtomicCheckpoints(TorchCheckpointIO):
         """Write ``checkpoint`` to ``path``."""
         content = io.BytesIO()  # as in `save_model`
         torch.save(checkpoint, content)
-        write_atomically(Path(path), lambda part: part.write_bytes(content.getbuffer()))
-
-
-def _single_threaded_worker(_: int) -> None:
-    """One thread in a data loader process: the cores are the training step's."""
-    torch.set_num_threads(1)
+        write_atomically(Path(path), content.getvalue())

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +11,17 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import ConfigError
 from erfsfm.common.progress import Progress
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher, Measures
+from erfsfm.data.exact_depth import by_label
+from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import find_weights, read_record
 
 
-@dataclass(frozen=True)
-class LearnedDepth:
-    """Inverse depth of images by the networks whose poses the teacher uses."""
-
-    weights: str
-
-    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """``(H, W)``, unscaled, of an image ``(H, W, 3)``."""
-        return np.reciprocal(_predictor(self.weights).depth(image))
+def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """``(H, W)``, unscaled, of an image ``(H, W, 3)``, by the networks whose poses the teacher uses."""
+    return np.reciprocal(_predictor(weights).depth(image))
 
 
 @lru_cache(maxsize=1)
@@ -38,7 +32,7 @@ def _predictor(weights: str) -> DepthPosePredictor:
 
 def imitated(config: ExperimentConfig) -> Learned | None:
     """Inverse depth in network units as the reference camera would see it, by the network that is imitated, if any."""
-    return LearnedDepth(config.teacher.slam_weights) if config.teacher.views == "network" else None
+    return partial(learned_inverse_depth, config.teacher.slam_weights) if config.teacher.views == "network" else None
 
 
 def seen_by_imitated(config: ExperimentConfig) -> list[str]:
@@ -63,17 +57,18 @@ def measured_views(
     """The teacher, with what is not there yet measured; None where the experiment has no many views.
 
     Args:
-        recordings: to train on.
+        recordings: to train on; those with exact depth need no measurement.
         config: of the experiment.
         folder: of the measurements.
         progress: told of the stage, what is done, and of how many.
     """
+    _, measured = by_label(recordings, config)
     if config.teacher.views != "many":
         return None
     size = (config.network.height, config.network.width)
-    measures: Measures = "poses" if config.training.networks == "pose" else "depth and poses"
+    with_depth = config.training.networks != "pose"
     cache_mb = labels_mb(config.data)
-    learned = LearnedDepth(config.teacher.slam_weights)
-    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, measures, learned)
-    teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, progress)
+    learned = partial(learned_inverse_depth, config.teacher.slam_weights)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, with_depth, learned)
+    teacher.prepare(measured, config.network.sources, config.teacher.slam_weights, progress)
     return teacher

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import split_recordings
+from erfsfm.data.split import split_recordings
 from erfsfm.geometry.camera import Camera
 
 RNG = np.random.default_rng(0)

@@ -38,7 +38,7 @@ def refusal(command_line: Callable[..., tuple[int, str, str]]) -> Refusal:
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
     config = NetworkConfig(depth_width=0.0625, pose_width=0.125, height=32, width=64)
-    save_model(tmp_path / "weights", Model(ModelRecord(network=config, trained_on=[]), *build_networks(config)))
+    save_model(tmp_path / "weights", Model(ModelRecord(network=config, trained_on=[]), build_networks(config)))
     return tmp_path / "weights"
 
 

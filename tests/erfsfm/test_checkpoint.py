@@ -22,9 +22,8 @@ FILES = ("depth.safetensors", "pose.safetensors")
 def fresh(**network: Any) -> Model:
     settings = {"depth_width": 0.0625, "pose_width": 0.125, "normalisation": "batch", "sources": 2}
     config = NetworkConfig.model_validate(settings | network)
-    depth_net, pose_net = build_networks(config)
     record = ModelRecord(network=config, trained_on=["simulated/0-9", "kitti_odometry/00[0:250]"], step=12)
-    return Model(record, depth_net, pose_net)
+    return Model(record, build_networks(config))
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def refusal(name: str | Path) -> str:
 
 
 def states(model: Model) -> list[torch.Tensor]:
-    return [*model.depth_net.state_dict().values(), *model.pose_net.state_dict().values()]
+    return [*model.networks["depth"].state_dict().values(), *model.networks["pose"].state_dict().values()]
 
 
 @pytest.mark.parametrize(
@@ -53,14 +52,14 @@ def test_round_trip(tmp_path: Path, network: dict[str, Any]) -> None:
     loaded = load_model(tmp_path)
     assert loaded.record == model.record
     assert all(torch.equal(a, b) for a, b in zip(states(loaded), states(model), strict=True))
-    assert not loaded.depth_net.training
-    assert not loaded.pose_net.training
+    assert not loaded.networks["depth"].training
+    assert not loaded.networks["pose"].training
 
 
 def test_half_precision(tmp_path: Path) -> None:
     """Half the size, weights to three digits, the statistics of batch normalisation exact."""
     model = fresh()
-    for name, value in model.depth_net.state_dict().items():
+    for name, value in model.networks["depth"].state_dict().items():
         if "running_var" in name:
             value.fill_(1e-7)  # half precision would round it to a tenth of its digits
     save_model(tmp_path / "full", model)
@@ -68,7 +67,9 @@ def test_half_precision(tmp_path: Path) -> None:
     sizes = [(tmp_path / name / "depth.safetensors").stat().st_size for name in ("full", "half")]
     assert sizes[1] < 0.65 * sizes[0]
     loaded = load_model(tmp_path / "half")
-    for (name, value), reference in zip(loaded.depth_net.state_dict().items(), model.depth_net.state_dict().values()):
+    for (name, value), reference in zip(
+        loaded.networks["depth"].state_dict().items(), model.networks["depth"].state_dict().values()
+    ):
         assert value.dtype == reference.dtype
         if "running_" in name or not value.is_floating_point():
             assert torch.equal(value, reference)

@@ -34,7 +34,7 @@ def run(command_line: Run) -> Run:
 def weights(tmp_path: Path) -> Path:
     config = NetworkConfig(depth_width=0.0625, pose_width=0.125, height=32, width=64)
     record = ModelRecord(network=config, trained_on=["simulated/17"])
-    save_model(tmp_path / "weights", Model(record, *build_networks(config)))
+    save_model(tmp_path / "weights", Model(record, build_networks(config)))
     return tmp_path / "weights"
 
 
@@ -162,7 +162,7 @@ def test_predict_leaves_out_what_it_cannot_read(
     old = ["--seed", "3"]  # accepted where nothing is random
     code, out, _ = run("predict", images, "--weights", weights, "--output", depth, *old)
     assert code == 0 and f"depth of 2 images in {depth}" in out
-    assert "1 of 3 images are left out" in caplog.text and "b.png is truncated" in caplog.text
+    assert "1 of 3 images cannot be read and are left out" in caplog.text and "b.png is truncated" in caplog.text
     assert sorted(p.name for p in depth.iterdir()) == ["a.npy", "a.png", "c.npy", "c.png"]
     assert np.load(depth / "a.npy").shape == (20, 30)
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from erfsfm.checkpoint import Absent, Model, build_networks
+from erfsfm.checkpoint import Model, build_networks
 from erfsfm.common.errors import ExportError
 from erfsfm.config import NetworkConfig
 from erfsfm.export import export_onnx, pose_path
@@ -27,7 +27,7 @@ def fresh(**settings: Any) -> Model:
     """Small networks whose deformable taps really move."""
     config = NetworkConfig.model_validate({"depth_width": 0.1, "pose_width": 0.2, "height": 64, "width": 96} | settings)
     nets = build_networks(config)
-    for module in (m for net in nets for m in net.modules()):
+    for module in (m for net in nets.values() for m in net.modules()):
         if isinstance(module, DeformableConv2d):
             nn.init.normal_(module.offset.weight, std=0.3)
             nn.init.normal_(module.offset.bias, std=2.0)
@@ -35,7 +35,7 @@ def fresh(**settings: Any) -> Model:
         if isinstance(module, nn.BatchNorm2d):
             module.running_mean.uniform_(-0.1, 0.1)
             module.running_var.uniform_(0.5, 2.0)
-    return Model(ModelRecord(network=config, trained_on=["simulated/0-9"]), *nets)
+    return Model(ModelRecord(network=config, trained_on=["simulated/0-9"]), nets)
 
 
 def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, 
     config = model.record.network
     images = torch.rand(1 + config.sources, 1, 3, config.height, config.width) * 2 - 1
     with torch.no_grad():
-        disparity, vectors = model.depth_net(images[0]), model.pose_net(images[0], list(images[1:]))
+        disparity, vectors = model.networks["depth"](images[0]), model.networks["pose"](images[0], list(images[1:]))
     np.testing.assert_allclose(onnx_output(tmp_path / "net.onnx", image=images[0]), disparity, rtol=1e-4)
     found = onnx_output(tmp_path / "net_pose.onnx", target=images[0], sources=images[1:].transpose(0, 1).contiguous())
     np.testing.assert_allclose(found, vectors, atol=1e-4 * float(vectors.abs().max()))
@@ -86,5 +86,5 @@ def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path) -> None:
 )
 def test_paper_fidelity(tmp_path: Path, pose: str) -> None:
     model = fresh(pose=pose, fidelity="paper", width=160, height=128)
-    export_onnx(Model(model.record, Absent("depth", tmp_path), model.pose_net), tmp_path / "net.onnx")
+    export_onnx(Model(model.record, {"pose": model.networks["pose"]}), tmp_path / "net.onnx")
     assert pose_path(tmp_path / "net.onnx").is_file()

@@ -194,7 +194,7 @@ def write_weights() -> Callable[..., Path]:
         torch.manual_seed(0)
         network = NetworkConfig(depth_width=0.1, pose_width=0.125, height=64, width=208, sources=sources)
         record = ModelRecord(network=network, trained_on=list(trained_on), licence="none, untrained")
-        save_model(folder, Model(record, *build_networks(network)))
+        save_model(folder, Model(record, build_networks(network)))
         return folder
 
     return write

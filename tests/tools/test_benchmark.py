@@ -52,13 +52,13 @@ def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics
 @pytest.fixture
 def job(tmp_path: Path) -> Any:
     drive = runs.BenchmarkSequence("loop 610", tmp_path / "world")
-    return runs.Job(tmp_path / "runs", drive, "sim", runs.EVERYTHING, 0)
+    return runs.Job(tmp_path / "runs", drive, "sim", runs.EVERYTHING, (), 0, "cpu")
 
 
 def results_of(job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
     """Results of configurations, one per seed."""
     return [
-        runs.JobResult(replace(job, configuration=runs.Configuration(name), seed=seed), metrics(ate))
+        runs.JobResult(replace(job, configuration=name, seed=seed), metrics(ate))
         for name, values in ates.items()
         for seed, ate in enumerate(values)
     ]
@@ -119,7 +119,7 @@ def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
     with (tmp_path / "out" / "accuracy.csv").open() as file:
         real, failed = csv.DictReader(file)
     assert (real["status"], real["frames"], failed["status"]) == ("ok", "8", "failed")
-    assert 0 < float(real["ate_7dof_optimised_m"]) < 1
+    assert 0 < float(real["ATE 7-dof, optimised"]) < 1
     assert "nonesuch" in failed["reason"]
     *_, head, real_row, failed_row = cells(report.read_text())
     assert [row[head.index("frames")] for row in (real_row, failed_row)] == ["8", "–"]

@@ -109,14 +109,15 @@ def longest_wait(o: JobResult) -> int | None:
     return max(waits, default=None)
 
 
-ATE = MetricDefinition(
-    "ate_7dof_known_m", "ATE 7-dof (m)", lambda o: None if o.reason else _error_and_path(o.job)[0], 3
-)
-PATH = MetricDefinition("path_known_m", "path (m)", lambda o: None if o.reason else _error_and_path(o.job)[1], 1)
-PERCENT = share("ate_7dof_known_percent", "7-dof, % of path", ATE, PATH, 100.0)
-LOSSES = MetricDefinition("losses", "losses", losses, 0)
-FIRST_MAP = MetricDefinition("frames_before_first_map", "frames before the first map", first_map, 0)
-NEW_MAP = MetricDefinition("frames_before_new_map", "most frames before a new map", longest_wait, 0)
-FOUND = MetricDefinition("located_frames", "located", lambda o: o.metrics.tracking.located_frames, 0)
-LOCATED = share("located_share", "share of frames located", FOUND, FRAMES, 1.0, 3)
+def _measured(place: int) -> Callable[[JobResult], float | None]:
+    return lambda o: None if o.reason else _error_and_path(o.job)[place]
+
+
+ATE = MetricDefinition("ATE 7-dof (m)", _measured(0), 3)
+PATH = MetricDefinition("path (m)", _measured(1), 1)
+PERCENT = share("7-dof, % of path", ATE, PATH, 100.0)
+LOSSES = MetricDefinition("losses", losses)
+FIRST_MAP = MetricDefinition("frames before the first map", first_map)
+NEW_MAP = MetricDefinition("most frames before a new map", longest_wait)
+LOCATED = share("share of frames located", MetricDefinition("located", "tracking.located_frames"), FRAMES, 1.0, 3)
 DEFINITIONS = (ATE, PATH, PERCENT, LOSSES, FIRST_MAP, NEW_MAP, LOCATED)

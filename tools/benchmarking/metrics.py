@@ -8,40 +8,43 @@ from operator import attrgetter
 from statistics import fmean, median, stdev
 from typing import Any
 
-from benchmarking.runs import JobResult, loops, ratio, revision, slug
+from benchmarking.runs import JobResult, loops, revision
 
 from erfsfm.common.table import DASH, Table
 
 Label = Callable[[JobResult], str]
 Cell = Callable[[Sequence[JobResult]], str]
 drive, kind, weights = attrgetter("job.drive.name"), attrgetter("job.drive.kind"), attrgetter("job.weights")
-configuration = attrgetter("job.configuration.name")
+configuration = attrgetter("job.configuration")
 
 
 @dataclass(frozen=True)
 class MetricDefinition:
-    """A metric of a run: its column in the CSV, its title in a table, its value, its decimals."""
+    """A number of a run: its title in tables and in the CSV, its source, its decimals.
 
-    key: str
+    The source is its path in ``metrics.json`` as in `Metrics.at`, or a function of the run.
+    """
+
     title: str
-    value: Callable[[JobResult], float | None]
-    decimals: int
+    source: str | Callable[[JobResult], float | None]
+    decimals: int = 0
 
-
-def _error(trajectory: str, alignment: str) -> MetricDefinition:
-    def value(o: JobResult) -> float | None:
-        error: float | None = o.metrics.at(f"trajectories.{trajectory}.align.{alignment}dof.ate_rmse_m")[0]
-        return error
-
-    title = f"ATE {alignment}-dof, {trajectory}"
-    return MetricDefinition(f"ate_{alignment}dof_{trajectory}_m", title, value, 2)
+    def value(self, o: JobResult) -> float | None:
+        """The number; None where it is not known."""
+        found: float | None = o.metrics.at(self.source)[0] if isinstance(self.source, str) else self.source(o)
+        return found
 
 
 def share(
-    key: str, title: str, part: MetricDefinition, whole: MetricDefinition, unit: float, decimals: int = 2
+    title: str, part: MetricDefinition, whole: MetricDefinition, unit: float, decimals: int = 2
 ) -> MetricDefinition:
     """A part of a whole, in a unit."""
-    return MetricDefinition(key, title, lambda o: ratio(part.value(o), whole.value(o), unit), decimals)
+
+    def value(o: JobResult) -> float | None:
+        of, total = part.value(o), whole.value(o)
+        return None if of is None or not total else unit * of / total
+
+    return MetricDefinition(title, value, decimals)
 
 
 def stage_seconds(o: JobResult, stage: str) -> float | None:
@@ -49,54 +52,51 @@ def stage_seconds(o: JobResult, stage: str) -> float | None:
     return (o.metrics.timing.stages or {}).get(stage)
 
 
-FRAMES = MetricDefinition("frames", "frames", lambda o: o.metrics.sequence.frames, 0)
-LENGTH = MetricDefinition("length_m", "path (m)", lambda o: o.metrics.sequence.length_m, 0)
-ERRORS = tuple(_error(trajectory, dof) for dof in "76" for trajectory in ("network", "odometry", "optimised"))
+FRAMES = MetricDefinition("frames", "sequence.frames")
+LENGTH = MetricDefinition("path (m)", "sequence.length_m")
+ERRORS = tuple(
+    MetricDefinition(f"ATE {dof}-dof, {trajectory}", f"trajectories.{trajectory}.align.{dof}dof.ate_rmse_m", 2)
+    for dof in "76"
+    for trajectory in ("network", "odometry", "optimised")
+)
 ATE_7, ATE_6 = ERRORS[2], ERRORS[5]
-_R_REL, _SCALE = (
-    attrgetter(f"metrics.trajectories.optimised.align.dof7.{name}") for name in ("r_rel_deg_per_100m", "scale")
-)
-R_REL = MetricDefinition("r_rel_deg_per_100m", "r_rel (deg / 100 m)", _R_REL, 2)
-SCALE = MetricDefinition("scale", "scale", _SCALE, 3)
-PERCENT = share("ate_7dof_optimised_percent", "7-dof, % of path", ATE_7, LENGTH, 100.0)
-PERCENT_6 = share("ate_6dof_optimised_percent", "6-dof, % of path", ATE_6, LENGTH, 100.0)
-NETWORK_PERCENT = share("ate_7dof_network_percent", "network, % of path", ERRORS[0], LENGTH, 100.0)
-OF_NETWORK = share("ate_7dof_of_network", "of network's", ATE_7, ERRORS[0], 1.0)
-LOOPS = MetricDefinition("loops_accepted", "loops closed", lambda o: o.metrics.loops.accepted, 0)
-TRUE_LOOPS = MetricDefinition("loops_true", "true loops", lambda o: loops(o.job.place)[0], 0)
-FALSE_LOOPS = MetricDefinition("loops_false", "false loops", lambda o: loops(o.job.place)[1], 0)
-COVERAGE = MetricDefinition("coverage_95", "coverage of 95 %", lambda o: o.metrics.graph.coverage.inside_95, 2)
-TRIANGLES = MetricDefinition("map_triangles", "map triangles", lambda o: o.metrics.map.triangles, 0)
+R_REL = MetricDefinition("r_rel (deg / 100 m)", "trajectories.optimised.align.7dof.r_rel_deg_per_100m", 2)
+SCALE = MetricDefinition("scale", "trajectories.optimised.align.7dof.scale", 3)
+PERCENT = share("7-dof, % of path", ATE_7, LENGTH, 100.0)
+PERCENT_6 = share("6-dof, % of path", ATE_6, LENGTH, 100.0)
+NETWORK_PERCENT = share("network, % of path", ERRORS[0], LENGTH, 100.0)
+OF_NETWORK = share("of network's", ATE_7, ERRORS[0], 1.0)
+LOOPS = MetricDefinition("loops closed", "loops.accepted")
+TRUE_LOOPS = MetricDefinition("true loops", lambda o: loops(o.job.place)[0])
+FALSE_LOOPS = MetricDefinition("false loops", lambda o: loops(o.job.place)[1])
+COVERAGE = MetricDefinition("coverage of 95 %", "graph.coverage.95", 2)
 MAP_ERRORS = (
-    MetricDefinition("map_accuracy_median_m", "accuracy, median (m)", lambda o: o.metrics.map.accuracy_median_m, 3),
-    MetricDefinition("map_accuracy_90_m", "90 % (m)", lambda o: o.metrics.map.accuracy_90_m, 2),
-    MetricDefinition(
-        "map_in_field_90_m", "90 % where the scanner looked (m)", lambda o: o.metrics.map.in_field.accuracy_90_m, 2
-    ),
-    MetricDefinition("map_completeness", "completeness, 0.3 m", lambda o: o.metrics.map.completeness, 2),
-    MetricDefinition("map_f_score_02", "F-score, 0.2 m", lambda o: o.metrics.map.f_score.m02, 2),
-    MetricDefinition("map_f_score_05", "0.5 m", lambda o: o.metrics.map.f_score.m05, 2),
-    MetricDefinition("map_double_wall_share", "double walls", lambda o: o.metrics.map.double_wall_share, 4),
+    MetricDefinition("accuracy, median (m)", "map.accuracy_median_m", 3),
+    MetricDefinition("accuracy, 90 % (m)", "map.accuracy_90_m", 2),
+    MetricDefinition("90 % where the scanner looked (m)", "map.in_field.accuracy_90_m", 2),
+    MetricDefinition("completeness, 0.3 m", "map.completeness", 2),
+    MetricDefinition("F-score, 0.2 m", "map.f_score.m02", 2),
+    MetricDefinition("F-score, 0.5 m", "map.f_score.m05", 2),
+    MetricDefinition("double walls", "map.double_wall_share", 4),
 )
+FUSED = MetricDefinition("frames fused", "map.frames_fused")
 MAP_SIZES = (
-    TRIANGLES,
-    MetricDefinition("map_blocks", "blocks", lambda o: o.metrics.map.blocks, 0),
-    MetricDefinition("map_submaps", "submaps", lambda o: o.metrics.map.submaps, 0),
-    MetricDefinition("map_frames_fused", "frames fused", lambda o: o.metrics.map.frames_fused, 0),
-    MetricDefinition("map_floater_share", "floaters", lambda o: o.metrics.map.floater_share, 3),
+    MetricDefinition("map triangles", "map.triangles"),
+    MetricDefinition("blocks", "map.blocks"),
+    MetricDefinition("submaps", "map.submaps"),
+    FUSED,
+    MetricDefinition("floaters", "map.floater_share", 3),
 )
-_MAP = MetricDefinition("map_seconds", "map (s)", lambda o: stage_seconds(o, "map"), 1)
-FUSION = share("fusion_ms_per_keyframe", "fusion (ms / keyframe)", _MAP, MAP_SIZES[3], 1e3, 1)
-MESH = MetricDefinition("mesh_seconds", "mesh (s)", lambda o: stage_seconds(o, "mesh"), 1)
-RATE = MetricDefinition("frames_per_second", "frames / s", lambda o: o.metrics.timing.frames_per_second, 1)
-MEMORY = MetricDefinition("peak_rss_mb", "peak RSS (MiB)", lambda o: o.metrics.timing.peak_rss_mb, 0)
-SECONDS = MetricDefinition("seconds_total", "seconds", lambda o: o.metrics.timing.seconds_total, 1)
-_CPU = MetricDefinition("cpu_seconds", "CPU s", lambda o: o.metrics.timing.cpu_seconds, 1)
-TIME = share("ms_per_frame", "ms / frame", SECONDS, FRAMES, 1e3, 1)
-CPU = share("cpu_ms_per_frame", "CPU ms / frame", _CPU, FRAMES, 1e3, 1)
+_MAP = MetricDefinition("map (s)", lambda o: stage_seconds(o, "map"), 1)
+FUSION = share("fusion (ms / keyframe)", _MAP, FUSED, 1e3, 1)
+MESH = MetricDefinition("mesh (s)", lambda o: stage_seconds(o, "mesh"), 1)
+RATE = MetricDefinition("frames / s", "timing.frames_per_second", 1)
+MEMORY = MetricDefinition("peak RSS (MiB)", "timing.peak_rss_mb")
+SECONDS = MetricDefinition("seconds", "timing.seconds_total", 1)
+TIME = share("ms / frame", SECONDS, FRAMES, 1e3, 1)
+CPU = share("CPU ms / frame", MetricDefinition("CPU s", "timing.cpu_seconds", 1), FRAMES, 1e3, 1)
 DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
-DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, TRIANGLES)
-DEFINITIONS += (*MAP_ERRORS, *MAP_SIZES[1:], FUSION, MESH)
+DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, *MAP_ERRORS, *MAP_SIZES, FUSION, MESH)
 DEFINITIONS += (RATE, MEMORY, SECONDS, TIME, CPU)
 
 
@@ -107,14 +107,14 @@ def rows(results: Sequence[JobResult], definitions: Sequence[MetricDefinition] =
         {
             "sequence": o.job.drive.name,
             "weights": o.job.weights,
-            "configuration": o.job.configuration.name,
+            "configuration": o.job.configuration,
             "seed": o.job.seed,
             "commit": commit,
             "status": "failed" if o.reason else "ok",
             "reason": o.reason,
             "leak": o.metrics.provenance.leak,
-            **{q.key: q.value(o) for q in (*DEFINITIONS, *definitions)},
-            **{f"seconds_{slug(stage)}": stage_seconds(o, stage) for stage in stages(results)},
+            **{q.title: q.value(o) for q in (*DEFINITIONS, *definitions)},
+            **{f"stage {stage} (s)": stage_seconds(o, stage) for stage in stages(results)},
         }
         for o in results
     ]

@@ -19,9 +19,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from erfsfm.common.files import write_atomically
 from erfsfm.common.table import DASH
 from slam.results.folder import RunFolder
-from slam.runtime.storage.files import write_atomically
 
 PICTURE = "images/trajectories.png"  # beside the page
 SIDE_IN = 1.9
@@ -36,6 +36,12 @@ PAGE = """# Benchmarks
 - Position errors (ATE RMSE) are in metres: mean, and ± standard deviation if there are several seeds.
 - *scale* is the factor by which the optimised trajectory must be multiplied to fit the truth best.
 """
+
+
+_COUNTS: dict[str, Cell] = {
+    "runs": lambda group: str(len(group)),
+    "failed": lambda group: str(sum(bool(o.reason) for o in group)),
+}
 
 
 def error_tables(results: Sequence[JobResult]) -> str:
@@ -56,7 +62,7 @@ Every drive:
 def maps_tables(results: Sequence[JobResult]) -> str:
     """Errors of the map with everything on and with one part turned off; sizes and cost."""
     rows = {"sequence": drive, "weights": weights, "configuration": m.configuration}
-    whole = [o for o in results if o.job.configuration.name == EVERYTHING.name]
+    whole = [o for o in results if o.job.configuration == EVERYTHING]
     costs = (*m.MAP_SIZES, m.FUSION, m.MESH, m.MEMORY)
     sizes = table({"sequence": drive, "weights": weights}, {q.title: over_seeds(q) for q in costs}, whole)
     return f"""Errors of the map after one rigid motion, by the best truth of each drive
@@ -88,8 +94,7 @@ Every recording:
 def handheld_summary(results: Sequence[JobResult]) -> str:
     """One row for each kind of recording and weights."""
     columns: dict[str, Cell] = {
-        "runs": lambda group: str(len(group)),
-        "failed": lambda group: str(sum(bool(o.reason) for o in group)),
+        **_COUNTS,
         "mean ATE 7-dof (m)": m.average(handheld.ATE),
         "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
         "losses in all": lambda group: f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH,
@@ -167,8 +172,7 @@ def with_section(page: str, new: str) -> str:
 def summary_table(results: Sequence[JobResult]) -> str:
     """One row for each kind of drive and weights; every number is over all of its runs."""
     columns: dict[str, Cell] = {
-        "runs": lambda group: str(len(group)),
-        "failed": lambda group: str(sum(bool(o.reason) for o in group)),
+        **_COUNTS,
         "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(m.PERCENT, max),
         "ATE 6-dof, % of path": m.middle_and_extreme(m.PERCENT_6, max),
         "the network's": m.middle_and_extreme(m.NETWORK_PERCENT, max),
@@ -192,7 +196,7 @@ def against_clean(results: Sequence[JobResult]) -> Cell:
     """Optimised 7-dof errors over those of the same drives without hazards."""
 
     def key(name: str, o: JobResult) -> tuple[str, str, str, int]:
-        return name, o.job.weights, o.job.configuration.name, o.job.seed
+        return name, o.job.weights, o.job.configuration, o.job.seed
 
     by_run = {key(o.job.drive.name, o): o for o in results}
 

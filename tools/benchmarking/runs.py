@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -50,24 +51,17 @@ class BenchmarkSequence:
     truth: Path | None = None
 
 
-@dataclass(frozen=True)
-class Configuration:
-    """Overrides of a run."""
-
-    name: str
-    overrides: tuple[str, ...] = ()
-
-
 QUIET = ("output.report=false",)
-ACCURACY = (Configuration("default", QUIET),)
-EVERYTHING = Configuration("everything on", QUIET)
-_MAP_PARTS: dict[str, tuple[str, ...]] = {
-    "depth not refined": ("depth.refine=none",),
-    "range to 30 m": ("mapping.depth_max_m=30",),
-    "holes left open": ("mapping.close_holes_m=0",),
-    "no loops": ("loops.enabled=false",),
+EVERYTHING = "everything on"
+# overrides of a run by the name of its configuration
+ACCURACY: dict[str, tuple[str, ...]] = {"default": QUIET}
+MAPS: dict[str, tuple[str, ...]] = {
+    EVERYTHING: QUIET,
+    "depth not refined": (*QUIET, "depth.refine=none"),
+    "range to 30 m": (*QUIET, "mapping.depth_max_m=30"),
+    "holes left open": (*QUIET, "mapping.close_holes_m=0"),
+    "no loops": (*QUIET, "loops.enabled=false"),
 }
-MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off)) for name, off in _MAP_PARTS.items()))
 # stretches of KITTI odometry at the size of its cameras, in a folder of recordings as the tests use it
 ORIGINALS = ("kitti_odometry_original", "failures/kitti03_full")
 
@@ -79,14 +73,15 @@ class Job:
     folder: Path
     drive: BenchmarkSequence
     weights: str
-    configuration: Configuration
+    configuration: str
+    overrides: tuple[str, ...]
     seed: int
-    device: str = "cpu"
+    device: str
 
     @property
     def title(self) -> str:
         """Title in tables and logs."""
-        return f"{self.drive.name}, {self.weights}, {self.configuration.name}, seed {self.seed}"
+        return f"{self.drive.name}, {self.weights}, {self.configuration}, seed {self.seed}"
 
     @property
     def place(self) -> Path:
@@ -102,7 +97,7 @@ class Job:
         words += ["--seed", str(self.seed), "--device", self.device]
         words += ["--frames", drive.frames] if drive.frames else []
         words += ["--truth", str(drive.truth)] if drive.truth else []
-        return (*words, *(word for override in self.configuration.overrides for word in ("--set", override)))
+        return (*words, *(word for override in self.overrides for word in ("--set", override)))
 
 
 @dataclass(frozen=True)
@@ -117,15 +112,17 @@ class JobResult:
 def plan(
     folder: Path,
     drives: Sequence[BenchmarkSequence],
-    configurations: Sequence[Configuration],
+    configurations: Mapping[str, Sequence[str]],
     weights: Sequence[str],
     seeds: Sequence[int],
-    changes: Sequence[str] = (),
-    device: str = "cpu",
+    changes: Sequence[str],
+    device: str,
 ) -> list[Job]:
     """Every combination, configuration by configuration."""
-    changed = [replace(c, overrides=(*c.overrides, *changes)) for c in configurations]
-    return [Job(folder, d, w, c, s, device) for c in changed for s in seeds for w in weights for d in drives]
+    return [
+        Job(folder, drive, each, name, (*overrides, *changes), seed, device)
+        for (name, overrides), seed, each, drive in product(configurations.items(), seeds, weights, drives)
+    ]
 
 
 def worlds(
@@ -138,12 +135,10 @@ def worlds(
 ) -> list[BenchmarkSequence]:
     """Simulated streets, with more ``options`` of ``simulate``; ``hazards`` are all of them at once."""
     found = []
-    for condition in conditions:
+    for condition, route, seed in product(conditions, routes, seeds):
         hazards = "" if condition == "clean" else ",".join(get_args(Hazard))
-        for route in routes:
-            for seed in seeds:
-                words = ("--route", route, "--seed", str(seed), "--frames", str(frames), *options)
-                found.append(simulated(folder, f"{route} {seed}", route, words, condition, hazards))
+        words = ("--route", route, "--seed", str(seed), "--frames", str(frames), *options)
+        found.append(simulated(folder, f"{route} {seed}", route, words, condition, hazards))
     return found
 
 
@@ -229,11 +224,6 @@ def is_false(T_from_to: FloatArray, T_world_from: FloatArray, T_world_to: FloatA
     off = invert(invert(T_world_from) @ T_world_to) @ T_from_to
     far = np.linalg.norm(off[:3, 3]) > FALSE_M
     return bool(far or rotation_angle(off[:3, :3]) > np.deg2rad(FALSE_DEG))
-
-
-def ratio(part: float | None, whole: float | None, unit: float) -> float | None:
-    """A part of a whole, in a unit."""
-    return None if part is None or not whole else unit * part / whole
 
 
 def slug(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, OneLineError
 from erfsfm.common.files import MAX_IMAGE_BYTES, read_bytes
+
+logger = logging.getLogger(__name__)
 
 Image = NDArray[np.uint8]
 T = TypeVar("T")
@@ -195,6 +198,14 @@ def first_size(files: Sequence[Path]) -> tuple[int, int]:
     """Height and width of the first readable image of the usual size; raises as `first_usual`."""
     height, width = first_usual(files, read_image)[1].shape[:2]
     return height, width
+
+
+def report_unreadable(reasons: Sequence[str], total: int, what: str) -> None:
+    """Warn once that some of many are left out, by the reason of the first; ``DataError`` where none can be read."""
+    if reasons and len(reasons) == total:
+        raise DataError(reasons[0] if total == 1 else f"none of {total} {what} can be read: {reasons[0]}")
+    if reasons:
+        logger.warning("%d of %d %s cannot be read and are left out: %s", len(reasons), total, what, reasons[0])
 
 
 def resize_image(image: Image, height: int, width: int) -> Image:

@@ -18,7 +18,8 @@ from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
 from erfsfm.data.exact_depth import FARTHEST_M, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.samples import FOCAL_LENGTH
-from erfsfm.data.snippets import SnippetDraws, chances, split_recordings
+from erfsfm.data.snippets import SnippetDraws, chances
+from erfsfm.data.split import split_recordings
 from erfsfm.data.window import HEIGHTS
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import find_weights, read_record

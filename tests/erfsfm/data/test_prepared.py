@@ -16,7 +16,8 @@ from erfsfm.common.errors import ConfigError, DataError, TrainingError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
+from erfsfm.data.split import split_recordings
 from erfsfm.training.run import prepare, train, trained_on
 
 Small = dict[str, dict[str, Any]]

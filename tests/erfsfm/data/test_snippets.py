@@ -20,8 +20,8 @@ from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.samples import FOCAL_LENGTH
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
-from erfsfm.data.split_file import Split, read_split_file
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
+from erfsfm.data.split import Split, read_split_file, split_recordings
 from erfsfm.data.window import snippet_motion
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions

@@ -12,7 +12,7 @@ import pytest
 from erfsfm.config import DataConfig
 from erfsfm.data.discovery import open_drive
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import split_recordings
+from erfsfm.data.split import split_recordings
 from erfsfm.data.standstill import moving_parts
 
 WriteDrive = Callable[..., Path]

@@ -74,7 +74,7 @@ def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path: Path, monkeyp
         return np.tile(np.eye(4), (len(numbers), 1, 1))
 
     monkeypatch.setattr(many_view_teacher, "drive_poses", drive_poses)
-    teacher = ManyViewTeacher(tmp_path / "measured", (16, 24), stride=2, measures="poses")
+    teacher = ManyViewTeacher(tmp_path / "measured", (16, 24), stride=2, with_depth=False)
     teacher.prepare([whole.part(20, 24)], 2, "sim", lambda *_: None)
     assert numbers == [20, 21, 22, 23]
 

@@ -12,7 +12,7 @@ STEPS = (100.0, 6.0, 3.0, 3.0, 2.0, 2.0)
 
 @pytest.fixture
 def rays() -> torch.Tensor:
-    return cell_rays(ROWS, COLUMNS, (1 / ROWS, 1 / COLUMNS), torch.device("cpu"))
+    return cell_rays(ROWS, COLUMNS, torch.device("cpu"))
 
 
 @pytest.fixture

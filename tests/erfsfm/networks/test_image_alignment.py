@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -98,9 +99,10 @@ def test_a_network_guesses_in_training_and_measures_afterwards() -> None:
 
 
 @torch.inference_mode()
-def test_its_graph_has_the_same_outputs() -> None:
+def test_its_graph_has_the_same_outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     network = build("posenet", width=0.1, alignment="images").eval()
-    graph = OnnxGraph(lambda: network, 1)
+    graph = OnnxGraph(lambda: network, 1, "a network")
     for seed in range(2):
         target, sources = snippet(TURNS * (1 - 2 * seed), seed)
         output = graph(target.numpy(), [source.numpy() for source in sources])

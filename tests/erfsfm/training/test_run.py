@@ -22,7 +22,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_model
+from erfsfm.checkpoint import Model, build_networks, load_model, save_model
 from erfsfm.common.errors import BusyError, ConfigError, DataError, TrainingError
 from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import Terminated
@@ -88,7 +88,7 @@ def both(small: Small, world: Path, held_out: Path) -> Configure:
 
 def weights_of(folder: Path) -> list[Tensor]:
     model = load_model(folder)
-    return [*model.depth_net.state_dict().values(), *model.pose_net.state_dict().values()]
+    return [*model.networks["depth"].state_dict().values(), *model.networks["pose"].state_dict().values()]
 
 
 def same(first: Path, second: Path) -> bool:
@@ -231,9 +231,8 @@ def poses_measured(world: Path, folder: Path) -> dict[str, Any]:
 def saved(config: ExperimentConfig, networks: TrainedNetworks, folder: Path) -> Path:
     """Weights of the experiment's networks, or of one of them."""
     record = ModelRecord(network=config.network, networks=networks, trained_on=[])
-    depth_net, pose_net = build_networks(config.network)
-    absent = {"depth": (depth_net, Absent("pose", folder)), "pose": (Absent("depth", folder), pose_net)}
-    save_model(folder, Model(record, *absent.get(networks, (depth_net, pose_net))))
+    every = build_networks(config.network)
+    save_model(folder, Model(record, {kind: every[kind] for kind in record.kinds}))
     return folder
 
 

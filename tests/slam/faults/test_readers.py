@@ -33,7 +33,7 @@ from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import load_experiment
 from erfsfm.convert import read_old
 from erfsfm.data.recordings import Recording
-from erfsfm.data.split_file import read_split_file
+from erfsfm.data.split import read_split_file
 from slam import run_slam
 from slam.config.sections import load_config
 from slam.formats.ply import read_ply, write_ply

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.inference import DepthPosePredictor, PreparedImage
+from erfsfm.inference import DepthPosePredictor
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.prediction.assembly import NetworkPredictor
 
@@ -44,11 +44,11 @@ def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredic
         sources = direct.sources
         poses = staticmethod(direct.poses)
 
-        def prepare(self, image: Image) -> PreparedImage:
+        def prepare(self, image: Image) -> NDArray[np.float32]:
             prepared.append(image)
             return direct.prepare(image)
 
-        def disparity(self, image: PreparedImage) -> NDArray[np.float32]:
+        def disparity(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
             asked.append(image)
             return direct.disparity(image)
 

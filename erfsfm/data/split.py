@@ -1,0 +1,214 @@
+"""Which recordings, and which of their frames, train, validate and test: by a file and by the configuration.
+
+Names are those of `erfsfm.common.readers.frame_range`.
+
+The shipped ones lie in ``configs/splits``. Single frames are written as runs: ``[0:64:3, 69, 72]`` are the frames
+0, 3, ..., 63, 69 and 72.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from pydantic import Field
+
+from erfsfm.common.config_tree import Section, read_model
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
+from erfsfm.config import DataConfig, config_folders
+from erfsfm.data.discovery import discover
+from erfsfm.data.recordings import Recording
+from erfsfm.data.standstill import moving_parts
+
+logger = logging.getLogger(__name__)
+
+_SHORTEST_STOP = 10  # frames of an own recording
+_SHORTEST_END = 20  # frames: fewer give neither a trajectory with its scale nor depth by many views
+_DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
+_FRAMES = re.compile(r"(?P<recording>.+)\[(?P<runs>[\d:, ]+)\]")
+_RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")
+
+
+class Split(Section):
+    """A division of recordings; a missing list is empty."""
+
+    train: list[str] = Field(default_factory=list, description="recordings or frame ranges; none: all that are found")
+    validation: list[str] = Field(default_factory=list, description="recordings or frame ranges that only validate")
+    test: list[str] = Field(default_factory=list, description="recordings or single frames")
+
+    @property
+    def test_recordings(self) -> list[str]:
+        """Recordings with a frame to test on, without their frames."""
+        matches = [(name.strip(), _FRAMES.fullmatch(name.strip())) for name in self.test]
+        return [name if match is None else match["recording"] for name, match in matches]
+
+    def test_frames(self) -> list[tuple[str, int]]:
+        """Every single frame to test on: its recording and number."""
+        return [frame for name in self.test for frame in _frames(name)]
+
+
+def read_split_file(name_or_path: str) -> Split:
+    """Read a shipped split by its name, or a file."""
+    path = Path(name_or_path)
+    if not path.is_file():
+        wheel, source = config_folders()  # beside the named configurations
+        folders = wheel / "splits", source.parent / "splits"
+        shipped = {file.stem: file for folder in folders for file in sorted(folder.glob("*.yaml"))}
+        if name_or_path not in shipped:
+            raise DataError(f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}")
+        path = shipped[name_or_path]
+    return read_model(Split, path, DataError, "is no split of train, validation and test")
+
+
+def _frames(name: str) -> list[tuple[str, int]]:
+    match = _FRAMES.fullmatch(name.strip())
+    runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
+    if match is None or None in runs:
+        raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
+    numbers: list[int] = []
+    for run in filter(None, runs):
+        first = int(run["first"])
+        numbers += range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
+    return [(match["recording"], number) for number in numbers]
+
+
+def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
+    """Recordings that hold at least one snippet; ``DataError`` where none does."""
+    kept = [r for r in recordings if len(r) >= length]
+    if not kept:
+        raise DataError(f"a snippet needs {length} consecutive frames; found {_lengths(recordings) or 'no recording'}")
+    return kept
+
+
+def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
+    """Training and validation recordings of all roots, by the configuration's split, ranges and exclusions."""
+    if not config.roots:
+        raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
+    split = read_split_file(config.split) if config.split else Split()
+    left_out = read_split_file(config.leave_out).test_recordings if config.leave_out != "none" else []
+    scenes = [FrameRange.parse(name) for name in left_out]
+    ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
+    listed = [FrameRange.parse(name) for name in split.train]
+    held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
+    never = [FrameRange.parse(name) for name in (*config.exclude, *split.test_recordings)]
+    unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
+    if unknown:
+        raise DataError(f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}")
+    found = [recording for root in config.roots for recording in discover(root)]
+    for key, span in zip(config.ranges, ranges):
+        if not any(_spans(recording, [span]) for recording in found):
+            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {_names(found)}")
+    _require_begun(found, [*ranges, *listed, *held_out])
+    training: list[Recording] = []
+    validation: list[Recording] = []
+    for recording in found:
+        validation += _parts(recording, held_out)
+        forbidden = [*held_out, *never, *(scenes if recording.name.startswith("kitti_raw/") else [])]
+        chosen = next((each for each in (ranges, listed) if _spans(recording, each)), None)  # ranges before a list
+        whole = [] if listed else [recording]
+        for part in whole if chosen is None else _parts(recording, chosen):
+            training += _rest(part, forbidden)
+    if not training:
+        raise DataError(
+            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used to validate or "
+            "test; see data.exclude, data.validation, data.split and data.leave_out"
+        )
+    if config.validation_share > 0:
+        training, ends = _ends_split_off(training, config.validation_share)
+        validation += ends
+    if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
+        wanted = _some([*config.validation, *split.validation])
+        raise DataError(
+            f"nothing to validate on: data.validation and data.split name {wanted}; found {_names(found)}; name one of "
+            "these, or train without validation by data.validation=[]"
+        )
+    named = config.validation if config.validation != _DEFAULT_VALIDATION else []
+    absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
+    if absent:
+        logger.warning("data.validation names %s, which is not among the data", _some(absent))
+    return _without_stops(training, config), _without_stops(validation, config)
+
+
+def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+    """The recordings without their last parts, and these."""
+    kept, ends = [], []
+    for recording in recordings:
+        cut = round((1 - share) * len(recording))
+        is_long = len(recording) - cut >= _SHORTEST_END
+        kept.append(recording.part(0, cut) if is_long else recording)
+        ends += [recording.part(cut, len(recording))] if is_long else []
+    if not ends:
+        raise DataError(
+            f"nothing to validate on: data.validation_share {share:g} leaves fewer than {_SHORTEST_END} frames of "
+            f"{_lengths(recordings)}: give longer recordings or a larger share"
+        )
+    return kept, ends
+
+
+def _lengths(recordings: Sequence[Recording]) -> str:
+    return _some([f"{recording.name} ({len(recording)} frames)" for recording in recordings])
+
+
+def _names(recordings: Sequence[Recording]) -> str:
+    return _some([recording.name for recording in recordings])
+
+
+def _some(names: Sequence[str]) -> str:
+    """Names for an error: each once, and the first few of many."""
+    distinct = list(dict.fromkeys(names))
+    return ", ".join(distinct[:8]) + (f" and {len(distinct) - 8} more" if len(distinct) > 8 else "")
+
+
+def _spans(recording: Recording, ranges: Sequence[FrameRange]) -> list[FrameRange]:
+    """Those ranges that are of a recording, by its own numbers."""
+    return [span for each in ranges if (span := each.counted_in(recording.name)) is not None]
+
+
+def _parts(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
+    """The parts of a recording that frame ranges name."""
+    parts = (recording.within(span.start, span.stop) for span in _spans(recording, ranges))
+    return [part for part in parts if part is not None]
+
+
+def _rest(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
+    """The parts of a recording before, between and after frame ranges."""
+    rest = [recording]
+    for span in _spans(recording, ranges):
+        sides = (side for part in rest for side in (part.within(0, span.start), part.within(span.stop, EVERYTHING)))
+        rest = [part for part in sides if part is not None]
+    return rest
+
+
+def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> None:
+    """Refuse frame ranges that begin after the last frame of the recording they name."""
+    for each in ranges:
+        named = [(r.start + len(r), span) for r in found for span in _spans(r, [each])]
+        if named and all(frames.start >= end for end, frames in named):
+            end, frames = max(named, key=lambda pair: pair[0])
+            raise DataError(f"{frames} begins after the {end} frames that the recording has")
+
+
+def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
+    """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
+    if config.static_frames == "keep":
+        return recordings
+    kept = [part for recording in recordings for part in _moving(recording)]
+    before = sum(map(len, recordings))
+    if (lost := before - sum(map(len, kept))) > 0:
+        logger.info("left out %d of %d frames in which the camera stands still", lost, before)
+    if recordings and not kept:
+        raise DataError("the camera stands still in every frame found: data.static_frames=keep trains on them")
+    return kept
+
+
+def _moving(recording: Recording) -> list[Recording]:
+    """A doubled frame of an own video is no stop, and its drive stays whole for the teacher."""
+    kind, _, _ = recording.name.partition("/")
+    if recording.without_stops or kind not in ("kitti_raw", "folder") or recording.exact:
+        return [recording]
+    if kind == "kitti_raw":
+        return moving_parts(recording)
+    return [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= min(_SHORTEST_END, len(recording))]

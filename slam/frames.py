@@ -1,4 +1,4 @@
-"""Data types shared by the parts of the system: frozen records, two protocols, depth between pixels.
+"""Data types shared by the parts of the system: frozen records, two protocols, depth and slopes of images.
 
 The front end, the graph and the map never import each other; ``slam/pipeline/run.py`` passes these between them.
 """
@@ -325,6 +325,11 @@ def resized_mask(mask: Mask, width: int, height: int) -> Mask:
     """The mask ``(height, width)`` of an image resized to so many pixels."""
     resized = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized, bool)
+
+
+def slopes_of(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
+    return [np.asarray(cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)]
 
 
 def _nearest(values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:

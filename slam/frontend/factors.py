@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, join_gap_ends
+from slam.frontend.gap_interpolation import join_gap_ends
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
@@ -27,10 +27,13 @@ from slam.geometry.se3 import FloatArray, compose, rigid
 logger = logging.getLogger(__name__)
 
 
-def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[RelativePose]:
+def make_factors(
+    drive: Drive, scale: Scale, lidar_steps: Sequence[RelativePose] = (), level: int = logging.INFO
+) -> list[RelativePose]:
     """All relative poses of a completed drive with their noise, in the unit of the scale.
 
-    What the pose network measured is a line in the log of this ``level``.
+    The least certain come first, and odometry is chained by the last ones; steps by LiDAR, in metres, stand before
+    those of image geometry. What the pose network measured is a line in the log of this ``level``.
     """
     maps = drive.map_poses
     geometric = _geometric(drive.steps, scale)
@@ -47,14 +50,7 @@ def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[
         [pose for pose in poses if not maps.is_inside(pose)] for poses in (networks, interpolated, geometric)
     )
     interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
-    return [*by_network, *interpolated, *by_image, *by_keyframes]
-
-
-def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
-    """The factors with LiDAR steps, all in metres, before those of image geometry, by which odometry is chained."""
-    less_certain = (NETWORK_SOURCE, INTERPOLATED_SOURCE)
-    before = [factor for factor in factors if factor.source in less_certain]
-    return [*before, *lidar_steps, *(factor for factor in factors if factor.source not in less_certain)]
+    return [*by_network, *interpolated, *lidar_steps, *by_image, *by_keyframes]
 
 
 def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:

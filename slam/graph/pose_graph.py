@@ -168,11 +168,13 @@ class PoseGraph:
 
     def _factors(self, values: Any) -> Any:
         graph = gtsam.NonlinearFactorGraph()
-        graph.add(_anchor(values.atPose3(0), is_loose=bool(self._positions)))
+        sigmas = _LOOSE_SIGMAS if self._positions else np.full(6, _ANCHOR_SIGMA)
+        graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
         for edge in self._relative_poses:
-            graph.add(_between(edge))
-        for position in self._positions:
-            graph.add(_position(position))
+            noise = _noise(edge.graph_sigmas)
+            graph.add(gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise))
+        for measured in self._positions:
+            graph.add(gtsam.GPSFactor(measured.index, measured.position, _noise(measured.sigmas)))
         return graph
 
     def _minimise(self, values: Any) -> Any:
@@ -219,21 +221,6 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
     loose = np.flatnonzero(component != component[0])
     if len(loose):
         raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
-
-
-def _anchor(pose: Any, is_loose: bool = False) -> Any:
-    sigmas = _LOOSE_SIGMAS if is_loose else np.full(6, _ANCHOR_SIGMA)
-    return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-
-
-def _between(edge: RelativePose) -> Any:
-    noise = _noise(edge.graph_sigmas)
-    return gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise)
-
-
-def _position(measured: MeasuredPosition) -> Any:
-    noise = _noise(measured.sigmas)
-    return gtsam.GPSFactor(measured.index, measured.position, noise)
 
 
 def _noise(sigmas: FloatArray) -> Any:

@@ -65,16 +65,14 @@ class _Rows:
 class MapSurface:
     """The cleaned surface of finished submaps."""
 
-    def __init__(
-        self, finished: Sequence[SpilledSubmap], fused: int, config: MappingConfig, progress: Progress = silent
-    ) -> None:
-        """Merge the submaps of so many fused frames and extract their surface.
+    def __init__(self, finished: Sequence[SpilledSubmap], config: MappingConfig, progress: Progress = silent) -> None:
+        """Merge the submaps and extract their surface.
 
         Raises:
             EmptyMapError: nothing was fused or seen often enough.
             SlamError: the disk is full.
         """
-        if fused == 0:
+        if not finished:
             raise EmptyMapError("the map is empty: no depth passed the filters")
         submaps = MergedSubmaps(finished)
         self._spill = SpillFile("the map")

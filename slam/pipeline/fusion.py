@@ -18,11 +18,13 @@ from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
+from slam.mapping.views import moved_rows
 from slam.pipeline.estimate import Estimate
 
 # relative sigma of learned depth in rooms, in the unit of the drive: 90 % of the errors are within 1.645 sigmas
 _ROOM_SIGMA = 0.32
 _SOME = 20
+_KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 _STREET_DEPTH_M = 15.0  # median depth of a street
 
 
@@ -48,14 +50,15 @@ def fuse(
         drive,
         scales,
         T_world_camera,
-        DepthError() if is_carried else estimate.depth_error,
+        DepthError() if is_carried else drive.depth_error,
         intrinsics,
         decide,
         _ROOM_SIGMA if is_carried and config.depth.is_learned else None,
     )
     mapping = config.mapping if estimate.scale.is_metric else fitted(config.mapping, drive, scales)
     tsdf_map = TsdfMap(mapping, intrinsics)
-    selected = tsdf_map.select([keyframe.index for keyframe in drive.keyframes], T_world_camera)
+    T_keyframes = T_world_camera[[keyframe.index for keyframe in drive.keyframes]]
+    selected = moved_rows(T_keyframes, mapping.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)
     with closing(read_ahead(depth_at, selected, CORES)) as ahead:
         for done, keyframe in enumerate(estimate.stopwatch.each("depth refinement", ahead), 1):
             compare(keyframe)

@@ -167,7 +167,7 @@ class Slam:
         self._observer.flush()
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        estimate = self._pipeline.solve(self._observer.observations(), Recorder())
+        estimate = self._pipeline.solve(self._observer.measured(), Recorder())
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         self._estimate = estimate
         return estimate.loops

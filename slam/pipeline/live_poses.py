@@ -9,8 +9,7 @@ from typing import Literal
 import numpy as np
 
 from slam.config.sections import SlamConfig
-from slam.frontend.agreement import frame_support
-from slam.frontend.drive import LAST_STEPS
+from slam.frontend.drive import LAST_STEPS, frame_support
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.scale.metric_scale import Scale, find_scale
@@ -135,7 +134,7 @@ class LivePoses:
         self._unit = unit
         if by_keyframes:
             return
-        T_odometry = chain_odometry(make_factors(window, scale, logging.DEBUG), len(window))
+        T_odometry = chain_odometry(make_factors(window, scale, level=logging.DEBUG), len(window))
         kept = max(first, self._settled)
         T_window_camera = T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, nearest_depth
+from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, View, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, track
 from slam.geometry.resection import PIXEL_SIGMA
@@ -160,6 +160,12 @@ class LocalMap:
         self.keyframes.append(keyframe)
         if len(self.keyframes) > _IMAGES_KEPT:
             self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
+
+    def views(self, points: FloatArray) -> list[View]:
+        """Corners of all keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
+        in_cameras = (apply(k.T_camera_world, points[k.track_ids]).astype(np.float32) for k in self.keyframes)
+        pairs = zip(self.keyframes, in_cameras, strict=True)
+        return [View(k.index, k.pixels.astype(np.float32), k.descriptors, own) for k, own in pairs]
 
     def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
         """Of all points, between those of the keyframes that see them."""

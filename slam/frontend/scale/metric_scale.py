@@ -98,7 +98,7 @@ def find_scale(
     if mode == "lidar":
         sigmas = {pose.ends: float(pose.sigmas[3]) for pose in lidar_steps}
         absolute |= {ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0}
-    by_planes = scale_from_road(drive.roads, height)
+    by_planes = scale_from_road(drive.roads, unit)
     if isinstance(by_planes, Failed):
         ratios = [absolute[ends][0] / motion.length_unscaled for ends, motion in motions.items() if ends in absolute]
         prior_unit = np.full(frames, float(np.median(ratios)) if ratios else 1.0)
@@ -106,7 +106,7 @@ def find_scale(
         # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
         prior_unit = np.full(frames, by_planes.value)
     else:
-        prior_unit = scale_track(drive.roads, height, by_planes)
+        prior_unit = scale_track(drive.roads, unit, by_planes)
     steps = links(motions, frames)
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
     if not isinstance(by_planes, Failed):

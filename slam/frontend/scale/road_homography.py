@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Frame, Intrinsics, Mask, resized_mask
-from slam.frontend.image_gate import slopes_of
+from slam.frames import Frame, Intrinsics, Mask, resized_mask, slopes_of
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.config.sections import ScaleConfig, ScaleMode
 from slam.frontend.scale.road_plane import GroundPlane
-from slam.geometry.robust import mad_sigma
+from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed, SlamError
 
@@ -40,16 +40,15 @@ def resolve_mode(config: ScaleConfig, camera_height_m: float | None, has_gps: bo
     return "gps" if has_gps else "none"
 
 
-def scale_from_road(roads: Sequence[GroundPlane | Failed], camera_height_m: float | None) -> ScaleEstimate | Failed:
-    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none).
+def scale_from_road(roads: Sequence[GroundPlane | Failed], height: float = 1.0) -> ScaleEstimate | Failed:
+    """Unit of the camera's ``height`` per unscaled length: metres, or camera heights where it is 1.
 
     The median over the frames without outliers, which are many MADs away.
     """
-    height = 1.0 if camera_height_m is None else camera_height_m
-    ratios = np.array([height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)])
-    if len(ratios) < MIN_FRAMES:
-        return Failed(f"only {len(ratios)} frames measure the scale, {MIN_FRAMES} are needed")
-    logarithms = np.log(ratios)
+    ratios = _ratios(roads, height)
+    logarithms = np.log(ratios[np.isfinite(ratios)])
+    if len(logarithms) < MIN_FRAMES:
+        return Failed(f"only {len(logarithms)} frames measure the scale, {MIN_FRAMES} are needed")
     deviations = np.abs(logarithms - np.median(logarithms))
     kept = logarithms[deviations <= _REJECTION_SIGMAS * mad_sigma(deviations) + 1e-12]
     spread = mad_sigma(kept - np.median(kept))
@@ -110,24 +109,20 @@ def scale_from_distance(
     return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
 
 
-def scale_track(
-    roads: Sequence[GroundPlane | Failed],
-    camera_height_m: float | None,
-    estimate: ScaleEstimate,
-) -> FloatArray:
+def scale_track(roads: Sequence[GroundPlane | Failed], height: float, estimate: ScaleEstimate) -> FloatArray:
     """The scale near each frame ``(N,)``: a running median over ground planes.
 
     The unit of learned depth drifts along a drive. Where the 41 frames around a frame hold too few
     usable planes, the estimate of the whole drive is used.
     """
-    height = 1.0 if camera_height_m is None else camera_height_m
-    ratios = np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])
+    ratios = _ratios(roads, height)
     bound = _REJECTION_SIGMAS * max(estimate.spread, 0.02)
     ratios[np.abs(np.log(ratios / estimate.value)) > bound] = np.nan
-    half = _SMOOTHING_FRAMES // 2
-    track = np.full(len(ratios), estimate.value)
-    for k in range(len(ratios)):
-        near = ratios[max(k - half, 0) : k + half + 1]
-        if np.isfinite(near).sum() >= MIN_FRAMES:
-            track[k] = np.nanmedian(near)
-    return track
+    known = np.pad(np.isfinite(ratios), _SMOOTHING_FRAMES // 2)
+    counts = np.lib.stride_tricks.sliding_window_view(known, _SMOOTHING_FRAMES).sum(axis=1)
+    return np.where(counts >= MIN_FRAMES, running_median(ratios, _SMOOTHING_FRAMES), estimate.value)
+
+
+def _ratios(roads: Sequence[GroundPlane | Failed], height: float) -> FloatArray:
+    """The camera's height over that above each ground plane ``(N,)``, NaN without one."""
+    return np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])

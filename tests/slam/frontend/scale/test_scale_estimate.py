@@ -19,7 +19,7 @@ def planes_of(heights) -> list[GroundPlane | Failed]:
 
 def test_without_a_height_the_unit_is_the_camera_height():
     roads = planes_of([0.5] * 9)
-    assert scale_from_road(roads, None).value == pytest.approx(2.0)
+    assert scale_from_road(roads).value == pytest.approx(2.0)
     assert scale_from_road(roads, 1.65).value == pytest.approx(3.3)
 
 

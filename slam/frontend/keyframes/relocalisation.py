@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics, View
-from slam.geometry.se3 import FloatArray, apply
+from slam.frontend.keyframes.local_map import LocalMap, TrackIds
+from slam.frontend.tracking import Pixels
+from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches
 
@@ -18,31 +19,27 @@ _PLACES_TRIED = 6
 _LEAST_POINTS = 30
 
 
-@dataclass(frozen=True)
-class Relocalised:
-    """``T_camera_map`` and the corners that see points: ``corners`` ``(M,)`` of the image.
+class Relocalised(NamedTuple):
+    """``T_camera_map``, and the points that the image sees, each once, by ``track_ids`` ``(M,)``.
 
-    ``keyframes`` ``(M,)`` are the rows of keyframes with these points and ``keyframe_corners`` ``(M,)`` theirs.
+    They are at ``pixels`` ``(M, 2)``; ``place`` is the frame of the keyframe with most of them.
     """
 
     T_camera_map: FloatArray
-    corners: NDArray[np.intp]
-    keyframes: NDArray[np.intp]
-    keyframe_corners: NDArray[np.intp]
-
-    @property
-    def nearest(self) -> int:
-        """The row of the keyframe with most of the points."""
-        return int(np.bincount(self.keyframes).argmax())
+    track_ids: TrackIds
+    pixels: Pixels
+    place: int
 
 
 class Relocaliser:
     """Finds single images among the keyframes of one map."""
 
-    def __init__(self, views: Sequence[View], T_map_camera: FloatArray, intrinsics: Intrinsics, seed: int = 0) -> None:
-        """Index keyframes, at least one, with points in the unit of the map and poses ``(V, 4, 4)``."""
-        self._views, self._T_map_camera, self._intrinsics = views, T_map_camera, intrinsics
-        self._index = PlaceIndex(views)
+    def __init__(self, local: LocalMap, intrinsics: Intrinsics, seed: int = 0) -> None:
+        """Index the keyframes of the map, at least one; ``seed`` is that of RANSAC."""
+        self.local, self._intrinsics = local, intrinsics
+        self._views = local.views(local.points)
+        self._T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in local.keyframes]))
+        self._index = PlaceIndex(self._views)
         self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
 
     def locate(self, image: View) -> Relocalised | None:
@@ -65,7 +62,11 @@ class Relocaliser:
         kept = kept[first]
         if len(kept) < _LEAST_POINTS:
             return None
-        return Relocalised(best.T_camera_points, rows[kept, 1], keyframes[kept], rows[kept, 0])
+        seen_by = zip(keyframes[kept].tolist(), rows[kept, 0].tolist(), strict=True)
+        tracks = np.array([self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by])
+        tracks, once = np.unique(tracks, return_index=True)
+        place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
+        return Relocalised(best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place)
 
     def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
         """Keyframes ``(M,)``, rows of their corners and of the image's ``(M, 2)``, and points in the map ``(M, 3)``."""

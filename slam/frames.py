@@ -254,16 +254,6 @@ class TrackingEvent:
         return f"frame {self.frame}: {self.event}{at}{by}"
 
 
-@dataclass(frozen=True)
-class MeasuredPosition:
-    """A measured ``position`` ``(3,)`` of the camera at a frame, in axes of its own, metres; ``sigmas`` ``(3,)`` are
-    along these axes."""
-
-    index: int
-    position: FloatArray
-    sigmas: FloatArray
-
-
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     """Unbroken runs of frame numbers as (first, last)."""
     found: list[tuple[int, int]] = []

@@ -10,10 +10,10 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.config.sections import GpsConfig, ScaleMode
 from slam.formats.trajectory import nearest_stamps
-from slam.frames import MeasuredPosition
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate
@@ -157,13 +157,17 @@ class GpsFixes:
         """From the fixes to the path at their times ``(M, 3)``, east, north and up."""
         return self._camera(T_enu_camera) - self.points
 
-    def at_frames(self, T_enu_world: FloatArray, T_world_camera: FloatArray) -> list[MeasuredPosition]:
-        """Every fix at the frame nearest in time, moved there by the camera's own motion."""
+    def at_frames(
+        self, T_enu_world: FloatArray, T_world_camera: FloatArray
+    ) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+        """Every fix at the frame nearest in time, moved there by the camera's own motion.
+
+        Frames ``(M,)``, east, north, up ``(M, 3)`` and sigmas ``(M, 3)`` for a graph, metres.
+        """
         frames = nearest_stamps(self.stamps, self._frame_stamps)
         T_enu_camera = T_enu_world @ T_world_camera
         moved = T_enu_camera[frames, :3, 3] - self._camera(T_enu_camera)
-        rows = zip(frames.tolist(), self.points + moved, self.widening * self.sigmas, strict=True)
-        return [MeasuredPosition(index, point, sigmas) for index, point, sigmas in rows]
+        return frames, self.points + moved, self.widening * self.sigmas
 
     def _camera(self, T_any_camera: FloatArray) -> FloatArray:
         """Positions of the camera ``(M, 3)`` at the fixes, from its poses ``(N, 4, 4)``."""

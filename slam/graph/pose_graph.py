@@ -13,12 +13,13 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from slam.formats.g2o import write_g2o
-from slam.frames import LOOP_SOURCE, MeasuredPosition, RelativePose
+from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry.se3 import FloatArray, invert, is_se3
 from slam.runtime.errors import SlamError
 
@@ -41,7 +42,7 @@ class PoseGraph:
         self._relative_poses: list[RelativePose] = []
         self._dropped: list[RelativePose] = []
         self._T_world_camera: FloatArray | None = None
-        self._positions: tuple[MeasuredPosition, ...] = ()
+        self._positions: list[tuple[int, FloatArray, FloatArray]] = []  # frame, position, sigmas
         self._T_fixed_world: FloatArray = np.eye(4)
 
     @property
@@ -74,9 +75,15 @@ class PoseGraph:
             _check(relative_pose)
         self._relative_poses += relative_poses
 
-    def add_positions(self, positions: Sequence[MeasuredPosition], T_fixed_world_initial: FloatArray) -> None:
-        """Add positions measured in axes in which the world lies about at ``T_fixed_world_initial`` ``(4, 4)``."""
-        self._positions, self._T_fixed_world = tuple(positions), T_fixed_world_initial
+    def add_positions(
+        self, frames: NDArray[np.intp], positions: FloatArray, sigmas: FloatArray, T_fixed_world_initial: FloatArray
+    ) -> None:
+        """Add positions ``(M, 3)`` at ``frames`` ``(M,)``, metres, with ``sigmas`` ``(M, 3)`` along their axes.
+
+        The world lies about at ``T_fixed_world_initial`` ``(4, 4)`` in these axes.
+        """
+        self._positions += zip(frames.tolist(), positions, sigmas, strict=True)
+        self._T_fixed_world = T_fixed_world_initial
 
     def optimise(self, T_world_camera_initial: FloatArray) -> FloatArray:
         """Solve for all poses from an initial trajectory; the first pose is fixed.
@@ -173,8 +180,8 @@ class PoseGraph:
         for edge in self._relative_poses:
             noise = _noise(edge.graph_sigmas)
             graph.add(gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise))
-        for measured in self._positions:
-            graph.add(gtsam.GPSFactor(measured.index, measured.position, _noise(measured.sigmas)))
+        for frame, position, own in self._positions:
+            graph.add(gtsam.GPSFactor(frame, position, _noise(own)))
         return graph
 
     def _minimise(self, values: Any) -> Any:

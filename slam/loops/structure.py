@@ -12,7 +12,6 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.geometry.triangulation import reprojection_errors, triangulate
 from slam.loops.places import Places
 from slam.loops.verification import LoopThresholds, matches
 
@@ -107,15 +106,61 @@ class PlaceStructure:
         """
         intrinsics, allowed_px = self._places.intrinsics, self._thresholds.reprojection_px
         rays, focal = intrinsics.rays(self.pixels(views, corners)), (intrinsics.fx, intrinsics.fy)
-        for tolerance in (2.0, 1.0, 1.0):  # wrong matches spoil the first points
+        for tolerance in (2.0, 1.0, 1.0, 1.0):  # wrong matches spoil the first points
             T = self._T_camera_world[views]
-            points, _ = triangulate(T, rays, point, count)
-            kept = reprojection_errors(T, points[point], rays, focal) < tolerance * allowed_px
-            views, corners, point, rays = views[kept], corners[kept], point[kept], rays[kept]
-        T = self._T_camera_world[views]
-        points, angle = triangulate(T, rays, point, count)
-        error = reprojection_errors(T, points[point], rays, focal)
-        kept = error < allowed_px
-        confirmed = np.bincount(point[kept], minlength=count) >= _LEAST_SIGHTINGS
+            points, angle = triangulate(T, rays, point, count)
+            error = reprojection_errors(T, points[point], rays, focal)
+            kept = error < tolerance * allowed_px
+            views, corners, point, rays, error = (each[kept] for each in (views, corners, point, rays, error))
+        confirmed = np.bincount(point, minlength=count) >= _LEAST_SIGHTINGS
         points[~confirmed | (angle < _LEAST_ANGLE)] = np.nan
-        return Tracks(points, views[kept], corners[kept], point[kept], error[kept])
+        return Tracks(points, views, corners, point, error)
+
+
+def triangulate(
+    T_camera_world: FloatArray, rays: FloatArray, point: NDArray[np.int64], count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Points ``(count, 3)`` closest to all their rays, and the widest angle between two of each point's rays, radians.
+
+    Least squares of the distances to the rays: ``sum (I - d d^T) (X - c) = 0``. NaN where rays are parallel.
+
+    Args:
+        T_camera_world: of each sighting ``(S, 4, 4)``.
+        rays: of each sighting in its camera ``(S, 3)``.
+        point: of each sighting ``(S,)``.
+        count: points.
+    """
+    R = T_camera_world[:, :3, :3]
+    centres = -np.einsum("sji,sj->si", R, T_camera_world[:, :3, 3])
+    directions = np.einsum("sji,sj->si", R, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    np.add.at(A, point, across)
+    np.add.at(b, point, np.einsum("sij,sj->si", across, centres))
+    usable = np.linalg.det(A) > 1e-12
+    X = np.full((count, 3), np.nan)
+    X[usable] = np.linalg.solve(A[usable], b[usable][:, :, None])[:, :, 0]
+    # against the first ray of each point: the widest angle within a factor of two, and in one pass
+    first = np.full(count, -1)
+    first[point[::-1]] = np.arange(len(point))[::-1]
+    cosine = (directions * directions[first[point]]).sum(axis=1)
+    angle = np.zeros(count)
+    np.maximum.at(angle, point, np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return X, angle
+
+
+def reprojection_errors(
+    T_camera_world: FloatArray, points: FloatArray, rays: FloatArray, focal: tuple[float, float]
+) -> FloatArray:
+    """Distances in pixels ``(S,)`` between sightings and their points; infinite behind a camera.
+
+    Args:
+        T_camera_world: of each sighting ``(S, 4, 4)``.
+        points: of each sighting ``(S, 3)``.
+        rays: of each sighting in its camera ``(S, 3)``, z = 1.
+        focal: lengths along both axes, pixels.
+    """
+    X = np.einsum("sij,sj->si", T_camera_world[:, :3, :3], points) + T_camera_world[:, :3, 3]
+    in_front = X[:, 2] > 0
+    offset = (X[:, :2] / np.where(in_front, X[:, 2], 1.0)[:, None] - rays[:, :2]) * focal
+    return np.where(in_front, np.linalg.norm(offset, axis=1), np.inf)

@@ -205,7 +205,18 @@ class Observer:
         return frames * step.length_unscaled > _MOVED_ON_HEIGHTS * height
 
     def _predict(self, frame: Frame) -> Future[DepthMap]:
-        return self._networks.submit(predicted_depth, self._predictor, frame)
+        """Depth ``(H, W)`` of a frame, by the networks' thread; ``SlamError`` where a user's predictor errs."""
+
+        def predict() -> DepthMap:
+            depth, wanted = self._predictor.depth(frame), frame.image.shape[:2]
+            shape, kind = np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
+            if shape != wanted or kind != np.float32:
+                raise SlamError(
+                    f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}"
+                )
+            return depth
+
+        return self._networks.submit(predict)
 
     def _ask_depth(self, keyframe: Frame) -> None:
         """Predict the depth of a keyframe while it is adjusted, unless it was asked for before."""
@@ -357,16 +368,3 @@ class Observer:
                 result = task.result.result()
             if result is not None:
                 task.keep(result)
-
-
-def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:
-    """Depth ``(H, W)`` of a frame.
-
-    Raises:
-        SlamError: a user's predictor gives something else.
-    """
-    depth = predictor.depth(frame)
-    wanted, shape, kind = frame.image.shape[:2], np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
-    if shape != wanted or kind != np.float32:
-        raise SlamError(f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}")
-    return depth

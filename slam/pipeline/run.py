@@ -270,7 +270,7 @@ class SlamPipeline:
         graph.add_relative(*odometry.factors, *(loop.measured for loop in loops.accepted))
         if isinstance(location, Location) and in_graph:
             positions = location.fixes.at_frames(location.T_enu_world, T_odometry)
-            graph.add_positions(positions, location.T_enu_world)
+            graph.add_positions(*positions, location.T_enu_world)
         with self._watch.stage("graph"):
             T_optimised = graph.optimise(T_odometry)
             while graph.drop_contradicted_loops():

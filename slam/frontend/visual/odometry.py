@@ -38,7 +38,8 @@ from slam.frontend.visual.two_view import (
     INLIER_PX,
     Matches,
     TwoViewEstimate,
-    TwoViewEstimator,
+    estimate,
+    refined,
 )
 from slam.geometry.epipolar import (
     UnitRelativePose,
@@ -93,7 +94,6 @@ class VisualOdometry:
         self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
         self._tracker = CornerTracker()
-        self._two_views = TwoViewEstimator(intrinsics.fx, seed)
         self.depth_error, self.focal_length = DepthError(), FocalLength()
         self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
@@ -171,11 +171,11 @@ class VisualOdometry:
                 return None
             votes, learned = np.ones(len(tracks), dtype=bool), nearest_depth(depth_first_unscaled, tracks.previous)
             matches = self._matches(tracks, votes, learned, None, mask, error)
-            estimate = self._two_views.refined(matches, known[0])
-            if estimate is None or estimate.inliers.sum() < MIN_INLIERS:
+            two_view = refined(matches, known[0])
+            if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
-            sigmas = np.sqrt(np.diag(estimate.covariance)[:3])
-            return RelativeRotation(first.index, last.index, estimate.unit_pose.R_current_previous, sigmas)
+            sigmas = np.sqrt(np.diag(two_view.covariance)[:3])
+            return RelativeRotation(first.index, last.index, two_view.unit_pose.R_current_previous, sigmas)
 
         return measure
 
@@ -208,7 +208,8 @@ class VisualOdometry:
         on_road = np.zeros(len(tracks), dtype=bool)
         if height is not None:
             on_road = np.abs(rays_previous[:, 1] * depth / height - 1.0) < _ROAD_TOLERANCE
-        return Matches(rays_previous, rays_current, depth, sigma, on_road, mask.weights(tracks.previous), votes)
+        weights, focal_px = mask.weights(tracks.previous), self._intrinsics.fx
+        return Matches(rays_previous, rays_current, depth, sigma, on_road, weights, votes, focal_px)
 
     def _still(self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray) -> Motion | None:
         flows = np.linalg.norm(tracks.current - tracks.previous, axis=1)
@@ -242,7 +243,7 @@ class VisualOdometry:
         ends, seconds = (frames[0].index, frames[1].index), frames[1].stamp - frames[0].stamp
 
         def step(corners: Matches, before: MotionHistory) -> Step | None:
-            two_view = self._two_views.estimate(corners, before)
+            two_view = estimate(corners, before, self._seed)
             if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
             return self._triangulated(ends, seconds, tracks, corners, trusted_depth(learned, height), two_view)

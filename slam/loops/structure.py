@@ -111,7 +111,8 @@ class PlaceStructure:
             points, angle = triangulate(T, rays, point, count)
             error = reprojection_errors(T, points[point], rays, focal)
             kept = error < tolerance * allowed_px
-            views, corners, point, rays, error = (each[kept] for each in (views, corners, point, rays, error))
+            views, corners, point = views[kept], corners[kept], point[kept]
+            rays, error = rays[kept], error[kept]
         confirmed = np.bincount(point, minlength=count) >= _LEAST_SIGHTINGS
         points[~confirmed | (angle < _LEAST_ANGLE)] = np.nan
         return Tracks(points, views, corners, point, error)

@@ -12,6 +12,7 @@ from threading import Event
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import calling_on_signals
 from erfsfm.common.threads import read_ahead
+from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
@@ -26,9 +27,11 @@ from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
 from slam.frontend.network_factors import chain_raw
-from slam.frontend.scale.metric_scale import Scale, find_scale, height_by_lidar
-from slam.frontend.scale.scale_estimate import (
+from slam.frontend.scale.metric_scale import (
+    Scale,
     ScaleEstimate,
+    find_scale,
+    height_by_lidar,
     resolve_mode,
     scale_from_distance,
     scale_from_reference,
@@ -38,7 +41,6 @@ from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
-from slam.mapping.depth_refinement import decision
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checks import require_possible, warn_of_doubts, warn_of_images
@@ -320,8 +322,9 @@ class SlamPipeline:
 
     @cached_property
     def _decide(self) -> Decide | None:
-        """Between learned and measured depth of the map's keyframes."""
-        return decision(self._config.depth) if self._config.mapping.enabled else None
+        """What decides between learned and measured depth of the map's keyframes; None where it is not refined."""
+        is_refined = self._config.mapping.enabled and self._config.depth.refine == "learned"
+        return DepthFusion(self._config.depth.fusion).decide if is_refined else None
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self.sequence.stamps, T_world_camera)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,18 +17,6 @@ _PLACES_TRIED = 6
 _LEAST_POINTS = 30
 
 
-class Relocalised(NamedTuple):
-    """``T_camera_map``, and the points that the image sees, each once, by ``track_ids`` ``(M,)``.
-
-    They are at ``pixels`` ``(M, 2)``; ``place`` is the frame of the keyframe with most of them.
-    """
-
-    T_camera_map: FloatArray
-    track_ids: TrackIds
-    pixels: Pixels
-    place: int
-
-
 class Relocaliser:
     """Finds single images among the keyframes of one map."""
 
@@ -42,8 +28,13 @@ class Relocaliser:
         self._index = PlaceIndex(self._views)
         self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
 
-    def locate(self, image: View) -> Relocalised | None:
-        """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few."""
+    def locate(self, image: View) -> tuple[FloatArray, TrackIds, Pixels, int] | None:
+        """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few.
+
+        Returns:
+            ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)`` where the image sees
+            them, and the frame of the keyframe with most of them.
+        """
         keyframes, rows, points = self._matched(image)
         best: Sighting | None = None
         for keyframe in np.unique(keyframes):
@@ -66,7 +57,7 @@ class Relocaliser:
         tracks = np.array([self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by])
         tracks, once = np.unique(tracks, return_index=True)
         place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
-        return Relocalised(best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place)
+        return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
 
     def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
         """Keyframes ``(M,)``, rows of their corners and of the image's ``(M, 2)``, and points in the map ``(M, 3)``."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends
 from slam.frontend.visual.motion import Motion, links
-from slam.geometry.robust import mad_sigmas
+from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert
 
 # sigmas over the jitter and over the residual, by Student's t on KITTI 00 and five simulated drives; ratios of other
@@ -67,7 +67,9 @@ def rotation_jitter(rotations: FloatArray) -> FloatArray:
     """
     third = rotations[3:] - 3 * rotations[2:-1] + 3 * rotations[1:-2] - rotations[:-3]
     third = third[np.isfinite(third).all(axis=1)]
-    return np.asarray(mad_sigmas(third) / _THIRD_DIFFERENCE) if len(third) >= _LEAST_STEPS else np.zeros(3)
+    if len(third) < _LEAST_STEPS:
+        return np.zeros(3)
+    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(third), axis=0) / _THIRD_DIFFERENCE)
 
 
 def neighbour_residual(values: FloatArray) -> FloatArray:

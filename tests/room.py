@@ -60,11 +60,13 @@ def frame(index: int, T_world_camera: FloatArray, seed: int = 0, near: bool = Tr
     return Frame(index, index / 30.0, image(T_world_camera, seed, near))
 
 
-def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometry:
-    """After the frames of a camera; each shows the walls of its seed."""
-    odometry = KeyframeOdometry(INTRINSICS)
+def tracked(
+    T_world_camera: FloatArray, seeds: list[int] | None = None, near: bool = True, draws: int = 0
+) -> KeyframeOdometry:
+    """After the frames of a camera; each shows the walls of its seed. ``draws`` is the seed of RANSAC."""
+    odometry = KeyframeOdometry(INTRINSICS, draws)
     for k, T in enumerate(T_world_camera):
-        view = frame(k, T, 0 if seeds is None else seeds[k])
+        view = frame(k, T, 0 if seeds is None else seeds[k], near)
         odometry.follow(view)
         odometry.learn(view, depth_map(T))
     return odometry

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -24,7 +25,6 @@ SOURCES = {
     for part in (*PACKAGES, "tools")
     for path in sorted((ROOT / part).rglob("*.py"))
 }
-TREES = {name: ast.parse(text) for name, text in SOURCES.items()}
 MODULES = [name for name in SOURCES if name.partition("/")[0] in PACKAGES]
 LOADERS: dict[str, Callable[[str], object]] = {
     "erfsfm": load_experiment,
@@ -37,6 +37,16 @@ MOST_PARAMETERS = 9
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 Definition = Function | ast.ClassDef
+
+
+@functools.cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse(SOURCES[name])
+
+
+@functools.cache
+def nodes(name: str) -> list[ast.AST]:
+    return list(ast.walk(tree_of(name)))
 
 
 def public(body: list[ast.stmt]) -> Iterator[Definition]:
@@ -52,7 +62,7 @@ def uses(*libraries: str) -> set[str]:
     """Files of both packages that import one of these libraries, also inside functions."""
     found = set()
     for name in MODULES:
-        for node in ast.walk(TREES[name]):
+        for node in nodes(name):
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 modules = [node.module]
@@ -71,20 +81,17 @@ def parameters(function: Function) -> int:
 
 
 def test_every_module_and_public_name_says_what_it_is() -> None:
-    silent = [name for name, tree in TREES.items() if not ast.get_docstring(tree)]
+    silent = [name for name in SOURCES if not ast.get_docstring(tree_of(name))]
     silent += [
-        f"{name}:{node.name}"
-        for name, tree in TREES.items()
-        for node in public(tree.body)
-        if not ast.get_docstring(node)
+        f"{name}:{node.name}" for name in SOURCES for node in public(tree_of(name).body) if not ast.get_docstring(node)
     ]
     assert not silent
 
 
 def test_files_and_functions_are_short_and_take_few_parameters() -> None:
     over = {name for name, text in SOURCES.items() if text.count("\n") > MOST_LINES}
-    for name, tree in TREES.items():
-        for node in ast.walk(tree):
+    for name in SOURCES:
+        for node in nodes(name):
             if isinstance(node, Function):
                 lines = (node.end_lineno or 0) - node.lineno + 1
                 if lines > MOST_FUNCTION_LINES or parameters(node) > MOST_PARAMETERS:
@@ -96,7 +103,7 @@ def test_only_command_lines_and_tools_print() -> None:
     calls = {
         name
         for name in MODULES
-        for node in ast.walk(TREES[name])
+        for node in nodes(name)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     }
     assert calls <= {"erfsfm/cli.py", "slam/commands/cli.py"}

@@ -23,7 +23,10 @@ DOCS = sorted((ROOT / "docs").rglob("*.md"))
 # the record of a network's training and the list of changes name what there was
 PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS)}
 LINKED = PAGES | {path: path.read_text() for path in (ROOT / "CHANGELOG.md", *ROOT.glob("erfsfm/weights/*/README.md"))}
-PROGRAMS = {"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.commands.cli.app}
+PROGRAMS: dict[str, Any] = {
+    "erfsfm": typer.main.get_command(erfsfm.cli.app),
+    "erfsfm-slam": typer.main.get_command(slam.commands.cli.app),
+}
 LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(?:#([^)\s]*))?\)")
 KINDS = ("slam", "erfsfm", "tools", "tests", "configs")
 FILE = re.compile(r"(?<![\w./-])(?:slam|erfsfm|tools|tests|configs|docs)/[\w./-]*\.(?:py|yaml|md)\b")
@@ -91,7 +94,7 @@ def test_commands_that_are_named_exist() -> None:
         sentences = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
         for command in re.findall(r"`((?:erfsfm|erfsfm-slam) [^`]+)`", sentences):
             program, *words = shlex.split(command.replace("[", "").replace("]", ""))
-            verb: Any = typer.main.get_command(PROGRAMS[program])
+            verb = PROGRAMS[program]
             while words and words[0] in getattr(verb, "commands", {}):
                 verb = verb.commands[words.pop(0)]
             known = {name for parameter in verb.params for name in parameter.opts} | {"--help"}

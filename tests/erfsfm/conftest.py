@@ -152,7 +152,12 @@ _CONFIGURATIONS = {
 }
 
 
-@pytest.fixture(params=_CONFIGURATIONS.values())
+@pytest.fixture(
+    params=[
+        pytest.param(name, marks=pytest.mark.slow if re.match("table[12]", name) else ())  # table 3 has both networks
+        for name in _CONFIGURATIONS.values()
+    ]
+)
 def configuration(request: pytest.FixtureRequest) -> str:
     """The name of a shipped configuration; each kind of networks and settings comes once."""
     return str(request.param)

@@ -51,12 +51,11 @@ def test_images_of_mixed_size(refusal: Refusal, tmp_path: Path, write_root: Writ
     assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_truncated_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, suffix: str) -> None:
-    root = write_root(tmp_path / "root", frames=5, suffix=suffix)
-    image = root / f"sequences/00/image_2/000002{suffix}"
+def test_truncated_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path) -> None:
+    root = write_root(tmp_path / "root", frames=5, suffix=".jpg")
+    image = root / "sequences/00/image_2/000002.jpg"
     image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
-    wanted = f"000002{suffix} is truncated"
+    wanted = "000002.jpg is truncated"
     assert wanted in refusal(*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run")
     assert wanted in refusal("predict", image, "--weights", weights, "--output", tmp_path / "depth")
     assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
@@ -98,17 +97,11 @@ def test_weights_that_are_not_finite(
     assert not (tmp_path / "depth").exists()
 
 
-FOREIGN = {
-    "a note": {"notes.txt": "mine"},
-    "our configuration and a note": {"config.yaml": dump_yaml(load_experiment("tiny")), "notes.txt": "mine"},
-}
-
-
-@pytest.mark.parametrize("files", FOREIGN.values(), ids=FOREIGN.keys())
-def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path, files: dict[str, str]) -> None:
+def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path) -> None:
+    files = {"config.yaml": dump_yaml(load_experiment("tiny")), "notes.txt": "mine"}
     output = tmp_path / "mine"
+    output.mkdir()
     for name, text in files.items():
-        (output / name).parent.mkdir(parents=True, exist_ok=True)
         (output / name).write_text(text)
     missing = tmp_path / "missing"  # the output is looked at before the data
     error = refusal(*TRAIN, *SMALL, "--dataset", missing, "--output", output)

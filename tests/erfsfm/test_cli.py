@@ -124,7 +124,8 @@ def test_networks_json(run: Run) -> None:
     assert by_name["depthnet"]["parameters"] == 31_596_900
     assert by_name["erf-posenet-dfc"]["parameters"] == 1_776_479
     assert by_name["depthnet"]["multiply_adds"] == pytest.approx(3.67e9, rel=0.01)
-    assert (by_name["posenet"]["receptive_field"], by_name["depthnet"]["receptive_field"]) == (263, 787)
+    fields = {"posenet": 263, "erf-posenet-dilated": 301, "depthnet": 787, "erf-depthnet-dilated": 829}
+    assert {name: by_name[name]["receptive_field"] for name in fields} == fields
     impossible = [row["name"] for row in rows if row["multiply_adds"] is None]
     assert impossible == ["erf-depthnet-dilated"]
     reasons = [value for key, value in by_name["erf-depthnet-dilated"].items() if "reason" in key]
@@ -135,32 +136,19 @@ def test_networks_json(run: Run) -> None:
 def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
     images = write_root(tmp_path / "root", frames=6) / "sequences/00/image_2"
     picture = tmp_path / "new/field.png"
-    options = ["--network", "posenet", "--network", "erf-posenet-dilated", "--height", "64", "--width", "96"]
-    code, out, err = run("receptive-field", *options, "--weights", weights, "--images", images, "--output", picture)
+    options = ["--network", "erf-posenet-dilated", "--height", "64", "--width", "96", "--output", picture]
+    plain = ["--network", "posenet", "--weights", weights, "--images", images]
+    code, out, err = run("receptive-field", *plain, *options)
     assert (code, err) == (0, "")
     assert "erf-posenet-dilated (paper)" in out and str(weights) in out and "263 px" in out
     assert cv2.imread(str(picture)) is not None
-    code, out, err = run("receptive-field", *options, "--output", picture, "--json")
+    code, out, err = run("receptive-field", "--network", "erf-posenet-dfc", *options, "--json")
     assert (code, err) == (0, "")
     rows = json.loads(out)
-    assert [row["theoretical_px"] for row in rows] == [263, 339, 301]
+    assert [row["theoretical_px"] for row in rows] == [511, 339, 301]
+    assert (rows[0]["theoretical_at_rest_px"], rows[0]["offsets_px"]) == (263, 1.0), "taps are pushed outwards"
+    assert [row["share_of_all_outputs"] for row in rows[1:]] == [1.0, pytest.approx(0.25)], "the paper's skips rows"
     assert {row["weights"] for row in rows} == {"untrained"}
-
-
-@pytest.mark.parametrize("folder", [False, True])
-def test_predict(run: Run, tmp_path: Path, weights: Path, folder: bool) -> None:
-    images = tmp_path / "images"
-    images.mkdir()
-    for name in ("a.png", "b.jpg"):
-        cv2.imwrite(str(images / name), np.full((20, 30, 3), 99, np.uint8))
-    given = images if folder else images / "a.png"
-    old = ["--seed", "3"]  # accepted where nothing is random
-    code, out, _ = run("predict", given, "--weights", weights, "--output", tmp_path / "depth", *old)
-    assert code == 0
-    assert f"depth of {2 if folder else 1} images" in out
-    wanted = ["a.npy", "a.png", "b.npy", "b.png"] if folder else ["a.npy", "a.png"]
-    assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == wanted
-    assert np.load(tmp_path / "depth" / "a.npy").shape == (20, 30)
 
 
 def test_predict_leaves_out_what_it_cannot_read(
@@ -168,14 +156,15 @@ def test_predict_leaves_out_what_it_cannot_read(
 ) -> None:
     images, depth = tmp_path / "images", tmp_path / "depth"
     images.mkdir()
-    for name in ("a.png", "b.png", "c.png"):
+    for name in ("a.png", "b.png", "c.jpg"):
         cv2.imwrite(str(images / name), np.full((20, 30, 3), 99, np.uint8))
     (images / "b.png").write_bytes((images / "b.png").read_bytes()[:60])
-    given = ["predict", images, "--weights", weights, "--output", depth]
-    code, out, _ = run(*given)
+    old = ["--seed", "3"]  # accepted where nothing is random
+    code, out, _ = run("predict", images, "--weights", weights, "--output", depth, *old)
     assert code == 0 and f"depth of 2 images in {depth}" in out
     assert "1 of 3 images are left out" in caplog.text and "b.png is truncated" in caplog.text
     assert sorted(p.name for p in depth.iterdir()) == ["a.npy", "a.png", "c.npy", "c.png"]
+    assert np.load(depth / "a.npy").shape == (20, 30)
 
 
 def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights: Path) -> None:

@@ -46,8 +46,8 @@ def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("depth", "pose"),
-    [  # the plainest network, and the one with the most operators, are quick
-        pytest.param(*pair, marks=() if pair[0] in ("depthnet", "erf-depthnet-dfcv2") else pytest.mark.slow, id=pair[0])
+    [  # networks/test_onnx_graph.py has graphs of the others
+        pytest.param(*pair, marks=() if pair[0] == "depthnet" else pytest.mark.slow, id=pair[0])
         for pair in zip(DEPTH, POSE)
     ],
 )
@@ -81,7 +81,9 @@ def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["net_pose.onnx"]
 
 
-@pytest.mark.parametrize("pose", [name for name in POSE if PRESETS[name].encoder == "paper"])
+@pytest.mark.parametrize(
+    "pose", ["erf-posenet-dilated", "erf-posenet-dfcv2", pytest.param("erf-posenet-dfc", marks=pytest.mark.slow)]
+)
 def test_paper_fidelity(tmp_path: Path, pose: str) -> None:
     model = fresh(pose=pose, fidelity="paper", width=160, height=128)
     export_onnx(Model(model.record, Absent("depth", tmp_path), model.pose_net), tmp_path / "net.onnx")

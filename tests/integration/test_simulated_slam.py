@@ -113,15 +113,6 @@ def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> Non
     assert np.median(street.street.distance_to_surface(points)) < 0.03
 
 
-@pytest.mark.slow
-def test_the_graph_alone_reduces_the_error(street: Rendered) -> None:
-    part = street.cut(0, 100)
-    options = ("visual_odometry.enabled=false", "mapping.enabled=false")
-    runs = [drive(part, seed, *options) for seed in range(4)]
-    before, after = (np.mean([ate(getattr(run, name), run) for run in runs]) for name in ("network", "optimised"))
-    assert after < 0.7 * before
-
-
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The embedded street through the networks trained on other streets."""

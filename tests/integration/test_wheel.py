@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hatchling.build
 import pytest
+import twine.commands.check
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ("erfsfm", "slam")
@@ -60,18 +62,30 @@ class Installed:
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     """A new environment with the wheel; dependencies are read from this one, its own install of the packages is not."""
     folder = tmp_path_factory.mktemp("wheel")
-    pip = (sys.executable, "-m", "pip")
-    call(sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", folder, folder=ROOT)
-    (sdist,) = folder.glob("*.tar.gz")
-    call(
-        *pip, "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "-w", folder, sdist,
-        folder=folder, PYTHONPATH=os.environ.get("PYTHONPATH", ""),
-    )  # fmt: skip
-    (wheel,) = folder.glob("*.whl")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        sdist = folder / hatchling.build.build_sdist(str(folder))
+        with tarfile.open(sdist) as archive:
+            archive.extractall(folder, filter="data")
+        patch.chdir(folder / sdist.name.removesuffix(".tar.gz"))
+        wheel = folder / hatchling.build.build_wheel(str(folder))
     environment = folder / "environment"
     call(sys.executable, "-m", "venv", "--without-pip", environment, folder=folder)
     python = environment / "bin" / "python"
-    call(*pip, "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel, folder=folder)
+    call(
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "install",
+        "--quiet",
+        "--no-compile",
+        "--no-deps",
+        "--no-index",
+        wheel,
+        folder=folder,
+    )
     (packages,) = environment.glob("lib/python*/site-packages")
     # a path in a .pth file is added as it is: .pth files in it, as that of an editable install, are not read
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
@@ -91,10 +105,8 @@ def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
         assert "/".join(parts) in names
 
 
-def test_an_index_takes_both(installed: Installed, tmp_path: Path) -> None:
-    path = os.environ.get("PYTHONPATH", "")
-    twine = (sys.executable, "-m", "twine", "check", "--strict")
-    call(*twine, installed.sdist, installed.wheel, folder=tmp_path, PYTHONPATH=path)
+def test_an_index_takes_both(installed: Installed) -> None:
+    assert not twine.commands.check.check([str(installed.sdist), str(installed.wheel)], strict=True)
     with tarfile.open(installed.sdist) as archive:
         names = {Path(*Path(name).parts[1:]).as_posix() for name in archive.getnames()}
     assert {"Makefile", "constraints.txt", "requirements.lock", "tests/conftest.py", "CONTRIBUTING.md"} <= names

@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import from_rotation_vector, invert
 from slam.results.folder import RunFolder
-from slam.results.metrics import Metrics, ScaleMetrics, SequenceMetrics
-from slam.runtime.errors import Failed
+from slam.results.metrics import Metrics, ScaleMetrics
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
@@ -81,17 +80,6 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any)
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
 
 
-def test_errors_relative_to_path_and_network(job: Any) -> None:
-    run = metrics(ate=0.9)
-    slower = metrics(ate=3.6).trajectories.network
-    run = run.changed(trajectories=run.trajectories.model_copy(update={"network": slower}))
-    definitions = columns.NETWORK_PERCENT, columns.PERCENT, columns.OF_NETWORK
-    shares = [each.value(runs.JobResult(job, run)) for each in definitions]
-    assert shares == pytest.approx([4.0, 1.0, 0.25])
-    run = run.changed(sequence=SequenceMetrics.of(length_m=Failed("no truth")))
-    assert columns.PERCENT.value(runs.JobResult(job, run)) is None
-
-
 @pytest.mark.parametrize(("moved_m", "turned_deg", "false"), [(1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)])
 def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float, false: int) -> None:
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
@@ -107,11 +95,6 @@ def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float,
     in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
     RunFolder(tmp_path).write_metrics(in_heights)
     assert runs.loops(tmp_path) == (None, None)
-
-
-def test_a_number_that_is_missing_is_named_below(job: Any) -> None:
-    text = page.maps_tables(results_of(job, {runs.EVERYTHING.name: [1.0]}))
-    assert "– map triangles, loop 610: not known." in text
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Depth from neighbours at known poses, on the simulated street, whose depth is exact."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,9 @@ from slam.simulation.street import SimulatedStreet
 
 @pytest.fixture(scope="module")
 def street() -> SimulatedStreet:
-    return SimulatedStreet(SimulationOptions(frames=250, seed=702))
+    street = SimulatedStreet(SimulationOptions(frames=250, seed=702, width=312, height=96))
+    street.render = functools.cache(street.render)
+    return street
 
 
 def _measured(street, index, neighbours, error=None):
@@ -21,7 +25,7 @@ def _measured(street, index, neighbours, error=None):
     return measure(grey[0], grey[1:], street.K, T, fine=True)
 
 
-@pytest.mark.parametrize("index", [40, 120, 200])
+@pytest.mark.parametrize("index", [40, 120])
 def test_depth_is_metric_and_its_sigma_tells_where_it_is_known(street, index):
     seen = _measured(street, index, [index + k for k in (-4, -2, -1, 1, 2, 4)])
     truth = street.render(index).depth

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -20,13 +22,10 @@ def small(name, fidelity="default"):
     "name, fidelity, wanted",
     [
         ("posenet", "paper", 263),
-        ("posenet", "default", 263),
-        ("erf-posenet-dfc", "default", 263),
         ("erf-posenet-dfcv2", "paper", 263),
         ("erf-posenet-dilated", "paper", 301),
         ("erf-posenet-dilated", "default", 339),
         ("depthnet", "paper", 787),
-        ("erf-depthnet-dfc", "default", 787),
         ("erf-depthnet-dfcv2", "default", 787),
         ("erf-depthnet-dilated", "default", 829),
     ],
@@ -42,14 +41,14 @@ def test_theoretical(name, fidelity, wanted):
         ("erf-posenet-dilated", "default", 0.0),
         ("erf-posenet-dilated", "paper", 0.0),
         ("erf-posenet-dfc", "default", 1.0),
-        ("erf-posenet-dfcv2", "default", 0.5),
+        pytest.param("erf-posenet-dfcv2", "default", 0.5, marks=pytest.mark.slow),
     ],
 )
 def test_theoretical_corner_is_where_gradients_begin(name, fidelity, offsets_px):
     """On an image large enough for the whole field."""
     network = small(name, fidelity)
     side = theoretical(network, offsets_px)
-    size = 2 * side // 128 * 128
+    size = math.ceil(side / 256) * 256
     field = measured(network, (size, size), offsets_px=offsets_px)
     assert (field.top, field.left) == theoretical_corner(network, field.pixel, offsets_px)
     assert (field.rows, field.columns) == (side, side)
@@ -59,11 +58,9 @@ def test_theoretical_corner_is_where_gradients_begin(name, fidelity, offsets_px)
     "name, fidelity, size, pixel, map_size, box, coverage",
     [
         ("posenet", "default", (128, 416), (0, 2), (1, 4), (128, 263), 0.632),
-        ("posenet", "default", (188, 620), None, (2, 5), (188, 263), 0.424),
         ("erf-posenet-dilated", "paper", (128, 416), (0, 1), (1, 3), (127, 297), 0.179),
         ("erf-posenet-dilated", "paper", (188, 620), None, None, (185, 301), 0.120),
         ("erf-posenet-dilated", "default", (128, 416), (0, 2), (1, 4), (128, 327), 0.733),
-        ("depthnet", "default", (128, 416), None, (1, 4), (128, 416), 1.0),
         ("erf-depthnet-dfc", "default", (128, 416), None, (1, 4), (128, 416), 1.0),
         ("depthnet-lite0", "default", (128, 416), (2, 6), (4, 13), (128, 416), 1.0),
     ],
@@ -81,11 +78,8 @@ def test_measured(name, fidelity, size, pixel, map_size, box, coverage):
     [
         ("erf-posenet-dfc", 0.0, 263, 0.632),
         ("erf-posenet-dfc", 0.5, 415, 0.998),
-        ("erf-posenet-dfc", 1.0, 415, 0.998),
         ("erf-posenet-dfc", 2.0, 416, 1.0),
-        ("erf-posenet-dfcv2", 0.0, 263, 0.632),
         ("erf-posenet-dfcv2", 0.5, 293, 0.704),
-        ("erf-posenet-dfcv2", 1.0, 293, 0.694),
         ("erf-posenet-dfcv2", 2.0, 321, 0.767),
     ],
 )

@@ -8,6 +8,8 @@ import os
 import pickle
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -24,7 +26,7 @@ from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_mo
 from erfsfm.common.errors import BusyError, ConfigError, DataError, TrainingError
 from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import Terminated
-from erfsfm.config import ExperimentConfig, TrainedNetworks, load_experiment
+from erfsfm.config import ExperimentConfig, TrainedNetworks, dump_yaml, load_experiment
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.inference import DepthPosePredictor
@@ -97,7 +99,7 @@ class Interrupt(Exception):
     """A power cut."""
 
 
-def cut_power_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+def interrupted(monkeypatch: pytest.MonkeyPatch, config: ExperimentConfig, output: Path, step: int) -> None:
     """The process dies in the midst of the step after ``step`` steps."""
     original = SelfSupervision.training_step
 
@@ -106,14 +108,9 @@ def cut_power_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
             raise Interrupt
         return original(self, batch, index)
 
-    monkeypatch.setattr(SelfSupervision, "training_step", dying)
-
-
-def interrupted(monkeypatch: pytest.MonkeyPatch, config: ExperimentConfig, output: Path, step: int) -> None:
-    with monkeypatch.context() as patched:
-        cut_power_at(patched, step)
-        with pytest.raises(Interrupt):
-            train(config, output, device="cpu")
+    with monkeypatch.context() as patched, pytest.raises(Interrupt):
+        patched.setattr(SelfSupervision, "training_step", dying)
+        train(config, output, device="cpu")
 
 
 def test_the_folder_can_be_used(both: Configure, tmp_path: Path) -> None:
@@ -149,7 +146,10 @@ def test_two_runs_are_equal(alone: Configure, tmp_path: Path) -> None:
     assert not same(tmp_path / "a", tmp_path / "c")
 
 
-@pytest.mark.parametrize("schedule, normalisation, average_decay", [("constant", "none", 0), ("cosine", "batch", 0.8)])
+@pytest.mark.parametrize(
+    "schedule, normalisation, average_decay",
+    [pytest.param("constant", "none", 0, marks=pytest.mark.slow), ("cosine", "batch", 0.8)],
+)
 def test_resume_ends_with_identical_weights(
     both: Configure,
     small: Small,
@@ -189,11 +189,11 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
     both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def steps_of(name: str, **training: Any) -> Path:
-        return train(both(training={"validate_every": 1, **training}), tmp_path / name, device="cpu") / "last"
+        return train(both(training=training), tmp_path / name, device="cpu") / "last"
 
-    first, second, third = (weights_of(steps_of(str(steps), steps=steps)) for steps in (1, 2, 3))
+    first, second, third = (weights_of(steps_of(str(steps), steps=steps, validate_every=9)) for steps in (1, 2, 3))
     expected = [a / 4 + b / 4 + c / 2 for a, b, c in zip(first, second, third, strict=True)]
-    averaged = steps_of("averaged", steps=3, average_decay=0.5)
+    averaged = steps_of("averaged", steps=3, average_decay=0.5, validate_every=1)
     torch.testing.assert_close(weights_of(averaged), expected)
     still = both(training={"steps": 1, "learning_rate": 1e-12}).model_copy(update={"initial_weights": str(averaged)})
     again = load_model(train(still, tmp_path / "still", device="cpu")).record.metrics
@@ -278,21 +278,21 @@ class Clock:
 def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
     small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six seconds, at a second a step, are six steps, whatever the number of steps allowed."""
+    """Three seconds, at a second a step, are three steps, whatever the number of steps allowed."""
     roots = [world, held_out]
-    six = configure(small, roots, training={"steps": 6, "schedule": "cosine", "validate_every": 100})
-    timed = configure(small, roots, training={**six.training.model_dump(), "steps": 1000, "minutes": 0.1})
-    train(six, tmp_path / "six", device="cpu")
+    three = configure(small, roots, training={"steps": 3, "schedule": "cosine", "validate_every": 100})
+    timed = configure(small, roots, training={**three.training.model_dump(), "steps": 1000, "minutes": 0.05})
+    train(three, tmp_path / "three", device="cpu")
     Clock(monkeypatch)
     train(timed, tmp_path / "timed", device="cpu")
     record = load_model(tmp_path / "timed" / "last").record
-    assert record.step == 6 and "abs_rel" in record.metrics, "the end is validated"
-    assert same(tmp_path / "timed" / "last", tmp_path / "six" / "last")
-    interrupted(monkeypatch, timed, tmp_path / "cut", step=4)
+    assert record.step == 3 and "abs_rel" in record.metrics, "the end is validated"
+    assert same(tmp_path / "timed" / "last", tmp_path / "three" / "last")
+    interrupted(monkeypatch, timed, tmp_path / "cut", step=2)
     train(timed, tmp_path / "cut", resume=True, device="cpu")
-    assert same(tmp_path / "cut" / "last", tmp_path / "six" / "last")
+    assert same(tmp_path / "cut" / "last", tmp_path / "three" / "last")
     train(timed, tmp_path / "cut", resume=True, device="cpu")
-    assert load_model(tmp_path / "cut" / "last").record.step == 6, "no time is left"
+    assert load_model(tmp_path / "cut" / "last").record.step == 3, "no time is left"
 
 
 @pytest.mark.parametrize(
@@ -469,15 +469,29 @@ def test_licence_of(seen: list[str], licence: str) -> None:
     assert licence_of(seen).startswith(licence)
 
 
-@pytest.mark.slow
-def test_two_processes_are_one_with_twice_the_batch(
-    both: Configure, tmp_path: Path, in_processes: Callable[..., None]
-) -> None:
-    """Batches of 2 in each of two processes; of 4 in one."""
+SCRIPT = """import sys
+from pathlib import Path
+from erfsfm.config import load_experiment
+from erfsfm.training.run import train
+if __name__ == '__main__':
+    train(load_experiment(sys.argv[1]), Path(sys.argv[2]), '--resume' in sys.argv, device='cpu')
+    print('trained')
+"""
 
-    def run(name: str, resume: bool = False, **training: Any) -> None:
-        config = both(training={"average_decay": 0.5} | training, data={"workers": 1})
-        in_processes(config, tmp_path / name, resume)
+
+@pytest.mark.slow
+def test_two_processes_are_one_with_twice_the_batch(both: Configure, tmp_path: Path) -> None:
+    """Batches of 2 in each of two processes; of 4 in one. Lightning starts the script again for a second device."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+
+    def run(name: str, *resume: str, **training: Any) -> None:
+        config, output = both(training={"average_decay": 0.5} | training, data={"workers": 1}), tmp_path / name
+        output.with_suffix(".yaml").write_text(dump_yaml(config))
+        command = [sys.executable, script, output.with_suffix(".yaml"), output, *resume]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == "trained\n", "by the first process alone"
 
     run("one", batch=4)
     run("two", batch=2, devices=2)
@@ -485,7 +499,7 @@ def test_two_processes_are_one_with_twice_the_batch(
         torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
     records = [load_model(tmp_path / name / "last").record for name in ("one", "two")]
     assert records[0].metrics == pytest.approx(records[1].metrics, rel=1e-4, abs=1e-7)
-    run("two", resume=True, batch=2, steps=6, devices=2)
-    run("one", resume=True, batch=4, steps=6)
+    run("two", "--resume", batch=2, steps=6, devices=2)
+    run("one", "--resume", batch=4, steps=6)
     for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # Adam divides by small moments

@@ -15,12 +15,13 @@ from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 QUALITIES = range(60, 90, 3)
+STREET = 24  # frames
 
 
 @functools.cache
 def street(hazards: tuple[str, ...] = ()) -> list[Image]:
     drive = SimulatedStreet(SimulationOptions("loop", 250, 704, 208, 64, hazards))
-    return [drive.render(k).image for k in range(40, 70)]
+    return [drive.render(k).image for k in range(40, 40 + STREET)]
 
 
 def noise(seed: int) -> Image:
@@ -90,7 +91,7 @@ def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
 
 
 @pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
-@pytest.mark.parametrize("first", [3, 9, 15])
+@pytest.mark.parametrize("first", [3, 9])
 def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(hazards: tuple[str, ...], first: int) -> None:
     images = street(hazards)
     copies = [jpeg(images[first], quality) for quality in QUALITIES]
@@ -102,7 +103,7 @@ def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(hazards: tu
 def test_copies_are_detected_where_every_image_is_compressed() -> None:
     images = [jpeg(image, 75) for image in street()]
     frozen = [jpeg(street()[9], quality) for quality in QUALITIES]
-    assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + ["new"] * 10
+    assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + ["new"] * (STREET - 20)
     assert set(verdicts(images)) == {"new"}
 
 
@@ -124,7 +125,7 @@ def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> 
 
 
 def test_a_simulated_stop_is_not_frozen() -> None:
-    drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 208, 64, ("stop",)))
+    drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 104, 32, ("stop",)))
     steps = np.linalg.norm(np.diff(drive.T_world_camera[:, :3, 3], axis=0), axis=1)
     assert (steps < 1e-9).sum() >= 10 and (steps > 0.5).sum() >= 10
     images = [jpeg(drive.render(k).image, 60 + k % 28) for k in range(60)]

@@ -102,7 +102,7 @@ def test_a_camera_that_moves_and_turns_steadily_stays_rigid() -> None:
     rng = np.random.default_rng(1)
     T_step = from_rotation_vector(np.array([0.002, 0.02, 0.001]), np.array([0.01, 0.0, -0.03]))
     true = before = now = np.eye(4)
-    for _ in range(1000):
+    for _ in range(300):
         true = T_step @ true
         points = rng.uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 6.0), (40, 3))
         predicted = now @ invert(before) @ now
@@ -121,20 +121,6 @@ def test_a_wrong_prediction_does_not_outweigh_the_last_pose() -> None:
     np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-2)
     assert (pose.residual_px[20:] < 3.0).all()
     assert (pose.residual_px[:20] > 3.0).all()
-
-
-def test_sigmas_are_of_the_size_of_the_errors() -> None:
-    points, pixels = seen()
-    rng = np.random.default_rng(3)
-    errors, sigmas = [], []
-    for _ in range(40):
-        pose = resect((T_TRUE,), points, pixels + rng.normal(0.0, 0.5, pixels.shape), INTRINSICS.K)
-        difference = pose.T_camera_world @ np.linalg.inv(T_TRUE)
-        errors.append([rotation_angle(difference[:3, :3]), np.linalg.norm(difference[:3, 3])])
-        sigmas.append([np.linalg.norm(pose.sigmas[:3]), np.linalg.norm(pose.sigmas[3:])])
-    ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / np.mean(sigmas, axis=0)
-    assert (ratio > 0.6).all()
-    assert (ratio < 1.6).all()
 
 
 def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_step() -> None:

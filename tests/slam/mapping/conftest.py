@@ -26,17 +26,18 @@ def _street(z: float) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def street_map() -> StreetMap:
-    """A map of 18 frames, 1 m apart, with images of one grey level each; its unit has ``per_metre`` to a metre."""
+    """A map of some frames, 1 m apart, with images of one grey level each; its unit has ``per_metre`` to a metre."""
 
     def make(
         grey: Callable[[int], float] = lambda k: 128.0,
         hidden: bool = False,
         per_metre: float = 1.0,
+        frames: int = 18,
         **config: float,
     ) -> TsdfMap:
         settings = MappingConfig(**{"depth_max_m": 20.0, **config}).in_unit(per_metre)
         tsdf_map = TsdfMap(settings, CAMERA)
-        for k in range(18):
+        for k in range(frames):
             depth = _street(float(k))
             if hidden:  # a hole of the road, 1 m wide, at z = 20
                 z = k + depth

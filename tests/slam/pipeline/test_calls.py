@@ -20,7 +20,7 @@ from slam.pipeline.run import SlamPipeline
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
-FRAMES = 50
+FRAMES = 30
 # calls over frames: a step measured by geometry, whose tracks all pass the first search at best
 MOST = {
     "depth": 0.6,
@@ -67,7 +67,7 @@ def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
 
 def test_calls_a_frame_of_a_hand_held_camera(monkeypatch: pytest.MonkeyPatch):
     """Two searches of corners for the frame; for a keyframe, two in each keyframe that still finds some of them."""
-    truth, calls = room.walk(60), Counter[str]()
+    truth, calls = room.walk(40), Counter[str]()
     monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", counted(calls, "flow", cv2.calcOpticalFlowPyrLK))
     keyframes = room.tracked(truth).segments[-1].map.keyframes
     assert 0 < calls["flow"] <= 2 * len(truth) + 16 * len(keyframes)

@@ -29,8 +29,8 @@ from slam.runtime.timing import Stopwatch
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
-FRAMES = 60
-BAD = range(25, 35)
+FRAMES = 40
+BAD = range(15, 25)
 FACTOR = 0.2
 
 Damage = Callable[[SimulatedSequence, int], Frame]
@@ -38,15 +38,6 @@ Damage = Callable[[SimulatedSequence, int], Frame]
 
 def black(sequence: SimulatedSequence, index: int) -> Frame:
     return Frame(index, float(sequence.stamps[index]), np.zeros((64, 208, 3), np.uint8))
-
-
-def noise(sequence: SimulatedSequence, index: int) -> Frame:
-    image = np.random.default_rng(index).integers(0, 255, (64, 208, 3), np.uint8)
-    return Frame(index, float(sequence.stamps[index]), image)
-
-
-def repeated(sequence: SimulatedSequence, index: int) -> Frame:
-    return Frame(index, float(sequence.stamps[index]), sequence.frame(BAD[0] - 1).image)
 
 
 def repeated_as_jpeg(sequence: SimulatedSequence, index: int) -> Frame:
@@ -137,7 +128,7 @@ def run_on(damage: Damage) -> tuple[Estimate, str]:
     logger = logging.getLogger("slam.pipeline")
     logger.addHandler(listing)
     try:
-        return run(damage), "\n".join(lines)
+        return run(damage, BAD, f"mapping.enabled={str(damage is black).lower()}"), "\n".join(lines)
     finally:
         logger.removeHandler(listing)
 
@@ -146,13 +137,7 @@ def ate(result: Estimate) -> float:
     return float(trajectory_metrics(result.optimised, result.reference).align.dof7.ate_rmse_m)
 
 
-DAMAGES = [
-    *(black, repeated_as_jpeg, missing, unreadable),
-    *(pytest.param(damage, marks=pytest.mark.slow) for damage in (noise, repeated)),  # test_image_gate.py has both
-]
-
-
-@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("damage", [black, repeated_as_jpeg, missing, unreadable], ids=lambda damage: damage.__name__)
 def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
     result, warnings = run_on(damage)
     for each in (result.network, result.odometry, result.optimised):
@@ -160,13 +145,13 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
         np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
     seen = result.drive
     assert set(seen.interpolated) == set(BAD)
-    assert warnings.count("are interpolated") == warnings.count("frames 25 to 34 are interpolated") == 1
+    assert warnings.count("are interpolated") == warnings.count("frames 15 to 24 are interpolated") == 1
     interpolated = [factor for factor in result.factors if factor.source == INTERPOLATED_SOURCE]
-    assert [factor.from_index for factor in interpolated] == list(range(24, 35))
+    assert [factor.from_index for factor in interpolated] == list(range(14, 25))
     assert min(factor.sigmas[0] for factor in interpolated) > 5 * np.deg2rad(0.3)
-    # the gap is ten metres of seventy; standing still through it would cost more than a metre
+    # the gap is ten metres of forty; standing still through it would cost more than a metre
     assert ate(result) < 0.6
-    assert result.map is not None and not {k.index for k in seen.keyframes} & set(BAD)
+    assert (result.map is not None) == (damage is black) and not {k.index for k in seen.keyframes} & set(BAD)
     assert not {view.index for view in seen.views} & set(BAD)
 
 
@@ -176,7 +161,7 @@ def test_frozen_frames_cost_no_more_than_black_ones() -> None:
 
 def test_doubled_frames_are_counted_and_cost_nothing() -> None:
     """Two frames come twice; the drive goes on where it was."""
-    rows = sorted([*range(FRAMES - 2), 20, 40])
+    rows = sorted([*range(FRAMES - 2), 12, 25])
 
     class Doubled(Damaged):
         def frame(self, index: int) -> Frame:
@@ -185,7 +170,7 @@ def test_doubled_frames_are_counted_and_cost_nothing() -> None:
     sequence = Doubled(street(), black, range(0))
     sequence.reference = street().reference[rows]
     result = SlamPipeline(sequence, oracle_of(sequence, rows), config_with("mapping.enabled=false")).run()
-    assert result.drive.doubled == [21, 42]
+    assert result.drive.doubled == [13, 27]
     assert result.drive.interpolated == {} and ate(result) < 0.6
 
 
@@ -201,7 +186,7 @@ def test_rolling_exposure_is_reported(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_many_gaps_are_counted_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
-    bad = range(6, FRAMES - 1, 5)
+    bad = range(6, FRAMES - 1, 3)
     run(black, bad, "mapping.enabled=false")
     first = ", ".join(map(str, bad[:10]))
     assert f"frames {first}, ... are interpolated: the image is blank" in caplog.text
@@ -224,11 +209,11 @@ def observe(frames: int, damage: Damage, bad: range, *overrides: str) -> Drive:
 
 
 def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
-    """Forty missing in a row are a gap in time; the thirty-first unreadable one is an error."""
-    assert sorted(observe(50, missing, range(8, 48)).unusable) == list(range(8, 48))
-    assert sorted(observe(38, unreadable, range(8, 48)).unusable) == list(range(8, 38))
-    with pytest.raises(SequenceError, match=r"image 38\.png is truncated"):
-        observe(39, unreadable, range(8, 48))
+    """Thirty-four missing in a row are a gap in time; the thirty-first unreadable one is an error."""
+    assert sorted(observe(FRAMES, missing, range(4, 38)).unusable) == list(range(4, 38))
+    assert sorted(observe(34, unreadable, range(4, 38)).unusable) == list(range(4, 34))
+    with pytest.raises(SequenceError, match=r"image 34\.png is truncated"):
+        observe(35, unreadable, range(4, 38))
 
 
 def test_a_missing_image_is_an_error_where_gaps_are_switched_off() -> None:
@@ -237,13 +222,13 @@ def test_a_missing_image_is_an_error_where_gaps_are_switched_off() -> None:
 
 
 def test_too_many_unreadable_images_raise_their_error() -> None:
-    with pytest.raises(SequenceError, match=r"image 28\.png is truncated"):
+    with pytest.raises(SequenceError, match=r"image 18\.png is truncated"):
         run(unreadable, BAD, "gaps.max_unread_frames=3")
-    with pytest.raises(SequenceError, match=r"image 25\.png is truncated"):
+    with pytest.raises(SequenceError, match=r"image 15\.png is truncated"):
         run(unreadable, BAD, "gaps.enabled=false")
 
 
-@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) -> None:
     sequence = Damaged(street(), black, range(12, 14))
     config = config_with("mapping.enabled=false", f"depth.frame_stride={stride}")
@@ -251,7 +236,7 @@ def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) ->
         Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) for _ in ("going on", "flushed")
     )
     with going_on, flushed:
-        for index in range(24):
+        for index in range(20):
             frame = sequence.frame(index)
             going_on.add(index, frame)
             flushed.add(index, Frame(index, frame.stamp, frame.image))
@@ -265,7 +250,7 @@ def assert_same(one: Observer, other: Observer) -> None:
     one.flush()
     other.flush()
     first, second = one.drive, other.drive
-    assert len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 15
+    assert len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 12
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (
         lambda o: [rotation.R_to_from for rotation in o.relative_rotations],
@@ -290,4 +275,4 @@ def test_the_threads_of_an_observer_end_with_it() -> None:
         for index in range(8):
             observer.add(index, sequence.frame(index))
         assert {thread.name for thread in set(threading.enumerate()) - before} == {"oracle_0", "beside_0"}
-    assert set(threading.enumerate()) == before
+    assert set(threading.enumerate()) <= before

@@ -21,6 +21,7 @@ FRAMES = 200
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 PLACE = np.array([49.0110, 8.4160, 115.0])
 SETTINGS = ["visual_odometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false", "loops.enabled=false"]
+SETTINGS += ["keyframes.use=never"]
 # the first camera looks east: its x axis points south, its y axis down
 T_ENU_WORLD = se3.make(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([5.0, -3.0, 1.0]))
 
@@ -135,7 +136,7 @@ def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(caplog: pytest.L
     assert result.optimised.length_m == pytest.approx(result.odometry.length_m, rel=1e-6)
 
 
-@pytest.mark.parametrize("ends", ["[20,80]", "[2.0s,8s]", "[8.04s,20]"])
+@pytest.mark.parametrize("ends", ["[20,80]", "[8.04s,20]"])
 def test_a_known_distance_gives_metres(ends: str) -> None:
     apart = float(np.linalg.norm(path()[80, :3, 3] - path()[20, :3, 3]))
     result = run(None, "scale.mode=known", f"scale.known_m={apart}", f"scale.known_between={ends}")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -25,11 +23,6 @@ def direct(tiny_weights: Path) -> DepthPosePredictor:
 def frames(first: int, count: int = 5) -> list[Frame]:
     rng = np.random.default_rng(first)
     return [Frame(k, 0.1 * k, rng.integers(0, 255, (48, 160, 3), np.uint8)) for k in range(first, first + count)]
-
-
-def again(asked: Sequence[Frame]) -> list[Frame]:
-    """The same images in frames that nothing was computed for yet."""
-    return [Frame(frame.index, frame.stamp, frame.image.copy()) for frame in asked]
 
 
 def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePredictor) -> None:
@@ -64,34 +57,3 @@ def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredic
         predictor.depth(frame)
     predictor.snippet(snippet)
     assert len(asked) == 5 and len(prepared) == 5
-
-
-class Answered(NamedTuple):
-    """An image as ``Counting`` prepares it."""
-
-    image: Image
-
-
-class Counting:
-    """Networks whose outputs are a formula of the images; they count their calls."""
-
-    sources = 4
-
-    def __init__(self, gain: int = 1) -> None:
-        self.asked = 0
-        self.prepared = 0
-        self._gain = gain
-
-    def prepare(self, image: Image) -> Answered:
-        self.prepared += 1
-        return Answered(image)
-
-    def disparity(self, image: Answered) -> NDArray[np.float32]:
-        self.asked += 1
-        return self._gain * (image.image[..., 0].astype(np.float32) + 1) / 7
-
-    def poses(self, images: Sequence[Answered]) -> NDArray[np.float64]:
-        self.asked += 1
-        T = np.tile(np.eye(4), (4, 1, 1))
-        T[:, 0, 3] = [image.image.mean() for image in images[:4]]
-        return T

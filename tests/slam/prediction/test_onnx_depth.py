@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from onnx import TensorProto, helper
 
 from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
@@ -17,6 +18,41 @@ from slam.runtime.errors import SlamError
 
 MakeNetwork = Callable[..., Path]
 PLAIN: dict[str, Any] = {"kind": "depth", "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
+
+
+@pytest.fixture
+def make_network(tmp_path: Path) -> MakeNetwork:
+    """Writes a network that gives the mean of an image's channels, scaled and shifted: ``gain * mean + shift``."""
+
+    def make(
+        name: str = "net.onnx",
+        shape: tuple[Any, ...] = (1, 3, 16, 32),
+        gain: float = 1.0,
+        shift: float = 0.0,
+        kind: int = TensorProto.FLOAT,
+        outputs: int = 1,
+        operator: str = "ReduceMean",
+    ) -> Path:
+        domain = "" if operator == "ReduceMean" else "strange.operators"
+        arguments = {"axes": [shape.index(3) if 3 in shape else 1], "keepdims": 1} if not domain else {}
+        nodes = [helper.make_node(operator, ["image"], ["mean"], domain=domain, **arguments)]
+        constants = []
+        for word, number in (("gain", gain), ("shift", shift)):
+            constants.append(helper.make_tensor(word, kind, [1], [number]))
+        nodes.append(helper.make_node("Mul", ["mean", "gain"], ["scaled"]))
+        nodes.append(helper.make_node("Add", ["scaled", "shift"], ["depth"]))
+        results = [helper.make_tensor_value_info("depth", kind, None)]
+        if outputs == 2:
+            results.append(helper.make_tensor_value_info("scaled", kind, None))
+        graph = helper.make_graph(
+            nodes, "tiny", [helper.make_tensor_value_info("image", kind, list(shape))], results, constants
+        )
+        imports = [helper.make_opsetid("", 17)] + ([helper.make_opsetid(domain, 1)] if domain else [])
+        path = tmp_path / name
+        onnx.save(helper.make_model(graph, opset_imports=imports, ir_version=8), path)
+        return path
+
+    return make
 
 
 def opened(path: Path, **settings: Any) -> OnnxDepth:
@@ -48,10 +84,10 @@ def test_depth_and_disparity_are_told_apart_and_unknown_pixels_stay_unknown(make
 def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: MakeNetwork) -> None:
     path = make_network(shape=(1, 3, "height", "width"))
     model = onnx.load(path)
-    shape = onnx.helper.make_tensor("shape", onnx.TensorProto.INT64, [3], [2, 14, 14])
+    shape = helper.make_tensor("shape", TensorProto.INT64, [3], [2, 14, 14])
     model.graph.initializer.append(shape)
     model.graph.node[-1].output[0] = "whole"
-    model.graph.node.append(onnx.helper.make_node("Reshape", ["whole", "shape"], ["depth"]))
+    model.graph.node.append(helper.make_node("Reshape", ["whole", "shape"], ["depth"]))
     onnx.save(model, path)
     with pytest.raises(SlamError, match=r"net\.onnx fails on an image of 32x16: .*"):
         opened(path, height=16, width=32)

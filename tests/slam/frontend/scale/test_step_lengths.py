@@ -25,10 +25,15 @@ def evidence(**measured: np.ndarray) -> StepEvidence:
     return StepEvidence(**(empty | measured))
 
 
-def ratios(noise: float = 0.0) -> dict[str, np.ndarray]:
+def ratios(noise: float = 0.0, seed: int = 0) -> dict[str, np.ndarray]:
     values = np.full(STEPS, np.nan)
-    values[1:] = np.diff(np.log(TRUE)) + noise * np.random.default_rng(0).normal(size=STEPS - 1)
+    values[1:] = np.diff(np.log(TRUE)) + noise * np.random.default_rng(seed).normal(size=STEPS - 1)
     return {"ratio": values, "ratio_sigma": np.where(np.isfinite(values), 0.001, np.nan)}
+
+
+def chained(noise: float, seed: int) -> dict[str, np.ndarray]:
+    """Ratios with the sigma of their noise, which is widened later."""
+    return ratios(noise, seed) | {"ratio_sigma": np.full(STEPS, noise / RATIO_WIDENING)}
 
 
 def noisy(sigma: float, seed: int = 1) -> np.ndarray:
@@ -139,16 +144,8 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.Monk
     middle = slice(80, 120)
     alone, together = [], []
     for seed in range(60):
-        rng = np.random.default_rng(seed)
-        chained = np.full(STEPS, np.nan)
-        chained[1:] = np.diff(np.log(TRUE)) + 0.02 * rng.normal(size=STEPS - 1)
-        measured = evidence(
-            absolute=noisy(0.06, seed=300 + seed),
-            absolute_sigma=np.full(STEPS, 0.06),
-            ratio=chained,
-            ratio_sigma=np.full(STEPS, 0.02 / RATIO_WIDENING),
-        )
-        solved = solve_lengths(measured)
+        absolute = {"absolute": noisy(0.06, seed=300 + seed), "absolute_sigma": np.full(STEPS, 0.06)}
+        solved = solve_lengths(evidence(**absolute, **chained(0.02, seed)))
         summed = np.log(solved.length / TRUE)[middle].sum()
         alone.append(summed / np.linalg.norm(solved.relative_sigma[middle]))
         together.append(CORRELATED_WIDENING * summed / np.linalg.norm(solved.relative_correlated_sigma[middle]))
@@ -163,17 +160,9 @@ def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPat
     for seed in range(20):
         road = noisy(0.06, seed=100 + seed)
         road[60:100] = np.nan
-        rng = np.random.default_rng(seed)
-        chained = np.full(STEPS, np.nan)
-        chained[1:] = np.diff(np.log(TRUE)) + 0.01 * rng.normal(size=STEPS - 1)
-        measured = evidence(
-            absolute=road,
-            absolute_sigma=np.full(STEPS, 0.06),
-            ratio=chained,
-            ratio_sigma=np.full(STEPS, 0.01 / RATIO_WIDENING),
-            learned=noisy(0.1, seed=200 + seed),
-        )
-        solved = solve_lengths(measured)
+        absolute = {"absolute": road, "absolute_sigma": np.full(STEPS, 0.06)}
+        learned = noisy(0.1, seed=200 + seed)
+        solved = solve_lengths(evidence(**absolute, learned=learned, **chained(0.01, seed)))
         errors.append(np.log(solved.length / TRUE))
         sigmas.append(solved.relative_sigma)
     ratio = np.abs(errors) / np.array(sigmas)

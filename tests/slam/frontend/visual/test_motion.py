@@ -59,10 +59,6 @@ def test_no_sigma_of_a_translation_is_zero() -> None:
     np.testing.assert_allclose(sigmas, [*ROTATION_SIGMAS, 0.008, 0.002, 0.1])
 
 
-def test_of_steps_that_begin_together_the_shortest_counts() -> None:
-    assert shortest_by_start([(3, 7), (0, 2), (3, 4), (0, 5), (1, 9)]) == {0: (0, 2), 1: (1, 9), 3: (3, 4)}
-
-
 @pytest.mark.parametrize(
     ("first", "last", "path"),
     [

@@ -149,11 +149,11 @@ def test_what_passes_before_the_camera_is_not_the_world(texture, forward):
     """It covers half of the image and has most of the corners there."""
     T_previous_current = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, forward]))
     odometry, T_world_camera, frames = VisualOdometry(CAMERA), np.eye(4), []
-    for k in range(36):
+    for k in range(20):
         frame, depth = render(T_world_camera, texture, k)
         noise = np.random.default_rng(k).normal(0.0, 1.0, frame.image.shape)
         noisy = Frame(k, frame.stamp, np.clip(frame.image + noise, 0, 255).astype(np.uint8))
-        frames.append((behind_block(noisy, 28 * (k - 4) - 372), UNIT * depth))
+        frames.append((behind_block(noisy, 56 * (k - 3) - 372), UNIT * depth))
         T_world_camera = T_world_camera @ T_previous_current
     for (previous, depth), (current, _) in itertools.pairwise(frames):
         measured = pose_of(odometry.measure(previous, current, depth, 1.65 * UNIT))
@@ -223,18 +223,6 @@ def test_track_ids_link_the_lengths_of_neighbouring_steps(texture):
         ratio = later.length_ratio
         assert ratio[0] == pytest.approx(np.log(steps[k + 1] / steps[k]), abs=0.01)
         assert 0 < ratio[1] < 0.01
-
-
-def test_the_true_length_makes_the_motion_true(texture):
-    truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 1.0]))
-    motion = measure(truth, texture, lambda depth: 2.0 * depth)
-    assert isinstance(motion, Motion)
-    length = float(np.linalg.norm(truth[:3, 3]))
-    metric = motion.with_length(length, 0.03, 0.09, NO_NOISE)
-    np.testing.assert_array_equal(metric.T_from_to[:3, :3], motion.relative_pose.T_from_to[:3, :3])
-    np.testing.assert_allclose(metric.T_from_to[:3, 3], truth[:3, 3], atol=0.02)
-    np.testing.assert_array_equal(metric.sigmas[:3], motion.relative_pose.sigmas[:3])
-    assert 0.03 <= metric.sigmas[5] < 0.035
 
 
 def test_a_rejected_motion_updates_neither_history_nor_dynamic_mask(texture):
@@ -309,7 +297,7 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(texture, turn_d
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "first", "last", "block", "largest_deg"),
-    [("00", 90, 121, False, 0.5), ("05", 90, 121, False, 0.5), ("00", 100, 170, True, 1.5)],
+    [("05", 90, 115, False, 0.5), ("00", 100, 145, True, 1.5)],
 )
 def test_rotation_on_real_frames(data_root, name, first, last, block, largest_deg):
     folder = data_root / "kitti_odometry" / "sequences" / name
@@ -320,7 +308,7 @@ def test_rotation_on_real_frames(data_root, name, first, last, block, largest_de
     for k in range(first, last):
         grey = cv2.imread(str(folder / "image_0" / f"{k:06d}.jpg"), cv2.IMREAD_GRAYSCALE)
         frame = Frame(k, 0.1 * k, np.repeat(grey[..., None], 3, axis=2))
-        frames.append(behind_block(frame, 16 * (k + 1 - first) - round(0.6 * grey.shape[1])) if block else frame)
+        frames.append(behind_block(frame, 24 * (k + 1 - first) - round(0.6 * grey.shape[1])) if block else frame)
     height, width = frames[0].image.shape[:2]
     intrinsics = Intrinsics(width, height, P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2])
     odometry = VisualOdometry(intrinsics)

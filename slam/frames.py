@@ -219,21 +219,6 @@ class RelativePose:
 
 
 @dataclass(frozen=True)
-class RelativeSimilarity:
-    """A measured similarity between two cameras whose units of length differ: ``p_from = scale R p_to + t``.
-
-    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of rotation and
-    translation; the last sigma is that of the logarithm of the scale.
-    """
-
-    from_index: int
-    to_index: int
-    T_from_to: FloatArray
-    scale: float
-    sigmas: FloatArray
-
-
-@dataclass(frozen=True)
 class TrackingEvent:
     """An event in the tracking of keyframes at a frame.
 

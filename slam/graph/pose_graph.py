@@ -177,10 +177,10 @@ class PoseGraph:
         sigmas = _LOOSE_SIGMAS if self._positions else np.full(6, _ANCHOR_SIGMA)
         graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
         for edge in self.relative_poses:
-            noise = _noise(edge.graph_sigmas)
+            noise = robust_noise(edge.graph_sigmas)
             graph.add(gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise))
         for frame, position, own in self._positions:
-            graph.add(gtsam.GPSFactor(frame, position, _noise(own)))
+            graph.add(gtsam.GPSFactor(frame, position, robust_noise(own)))
         return graph
 
     def _drop_newest_loop(self, reason: str) -> None:
@@ -213,7 +213,8 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
         raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
 
 
-def _noise(sigmas: FloatArray) -> Any:
+def robust_noise(sigmas: FloatArray) -> Any:
+    """GTSAM's model of independent errors with these sigmas and Huber's loss."""
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
 

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
+from slam.frames import Intrinsics, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
 from slam.frontend.keyframes.joining import join
 from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.scale.metric_scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
-from slam.graph.similarity_graph import optimise_similarities
+from slam.graph.similarity_graph import RelativeSimilarity, optimise_similarities
 from slam.loops.closure import LoopClosures, find_loops, most_inliers_first
 from slam.loops.consistency import Track
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
@@ -86,7 +86,7 @@ class _Rows:
         self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
         counts = [len(segment.map.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
-        self.T_map_camera = invert(np.array([k.T_camera_world for k in self.keyframes]).reshape(-1, 4, 4))
+        self.T_map_camera = np.concatenate([segment.map.T_world_camera for segment in maps])
         self.track = self._track(poses)
 
     def _track(self, poses: KeyframePoses) -> Track:

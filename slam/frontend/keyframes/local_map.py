@@ -101,8 +101,8 @@ class TrackedKeyframe:
     """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
 
     ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the middle row.
-    ``learned_depth`` ``(M,)`` is NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once the image is
-    not kept any more.
+    ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once
+    the image is not kept any more.
     """
 
     index: int
@@ -144,6 +144,11 @@ class LocalMap:
     def copy(self) -> LocalMap:
         """A snapshot, which stays while this map grows."""
         return LocalMap(self.keyframes.copy(), self.points.copy())
+
+    @property
+    def T_world_camera(self) -> FloatArray:
+        """Poses of the keyframes ``(K, 4, 4)``."""
+        return invert(np.array([keyframe.T_camera_world for keyframe in self.keyframes]).reshape(-1, 4, 4))
 
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
@@ -252,7 +257,7 @@ class LocalMap:
 
         track = joined(keyframe.track_ids for keyframe in keyframes)
         pixel = joined(keyframe.pixels for keyframe in keyframes)
-        depth = joined(np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan) for keyframe in keyframes)
+        depth = joined(keyframe.learned_depth for keyframe in keyframes)
         sigma = self.parallax(keyframes).prior_sigma(PIXEL_SIGMA / intrinsics.fx)[track]
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
@@ -261,8 +266,7 @@ class LocalMap:
     def ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
         """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""
         depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
-        learned = np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan)
-        return np.asarray(depth / learned)
+        return np.asarray(depth / keyframe.learned_depth)
 
     def aligned(self, image: NewImage, track_ids: TrackIds, pixels: Pixels) -> Pixels:
         """Corners of a new keyframe aligned to the earliest of the last keyframes that sees them, against drift."""

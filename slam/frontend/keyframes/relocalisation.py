@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.frames import Intrinsics, View
 from slam.frontend.keyframes.local_map import LocalMap, TrackIds
 from slam.frontend.tracking import Pixels
-from slam.geometry.se3 import FloatArray, apply, invert
+from slam.geometry.se3 import FloatArray, apply
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches
 
@@ -23,8 +23,7 @@ class Relocaliser:
     def __init__(self, local: LocalMap, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Index the keyframes of the map, at least one; ``seed`` is that of RANSAC."""
         self.local, self._intrinsics = local, intrinsics
-        self._views = local.views(local.points)
-        self._T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in local.keyframes]))
+        self._views, self._T_map_camera = local.views(local.points), local.T_world_camera
         self._index = PlaceIndex(self._views)
         self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
 

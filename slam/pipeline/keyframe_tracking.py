@@ -17,9 +17,8 @@ from slam.frontend.keyframes.local_map import LocalMap, MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.unit import learned_unit
-from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.scale.road_plane import height_of
 from slam.geometry.se3 import FloatArray, invert
-from slam.runtime.errors import Failed
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
@@ -154,8 +153,3 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
     if len(first) < _MOST_STEPS and not is_clear:
         return None
     return is_fast and scatter_deg < _VEHICLE_SCATTER_DEG
-
-
-def height_of(road: GroundPlane | Failed) -> float | None:
-    """The camera's height over the ground plane of a frame, unscaled; None without one."""
-    return road.height_unscaled if isinstance(road, GroundPlane) else None

@@ -16,8 +16,8 @@ import numpy as np
 from erfsfm.common.files import FolderLock
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.signals import raising_on_termination
+from slam.commands.live_source import Source, open_source
 from slam.commands.run import FolderRecorder, Request, provenance_of, record
-from slam.commands.source import Source, open_source
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics

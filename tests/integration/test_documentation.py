@@ -30,6 +30,7 @@ import pytest
 import torch
 import typer
 import yaml
+from matplotlib import rc_context
 from onnx import TensorProto, helper
 
 import erfsfm.cli
@@ -178,7 +179,6 @@ RUNNABLE = [*{block.text: block for block in reversed(commands()) if not reason_
 
 
 MAINS: dict[str, Any] = {"erfsfm": erfsfm.cli.main, "erfsfm-slam": slam.commands.cli.main}
-MAINS |= {point.name: point.load() for point in entry_points(group="console_scripts") if point.name in EVO}
 
 
 def call(command: str) -> None:
@@ -190,8 +190,8 @@ def call(command: str) -> None:
         finished = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
         assert finished.returncode == 0, finished.stdout + finished.stderr
         return
-    main = MAINS[program]
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, rc_context():  # evo changes the settings of Matplotlib
+        main = MAINS.get(program) or entry_points(group="console_scripts")[program].load()
         patch.setattr(sys, "argv", [program, *arguments])
         try:
             main()

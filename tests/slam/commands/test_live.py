@@ -24,7 +24,7 @@ import pytest
 
 from slam import run_slam
 from slam.commands.live import LiveRequest, StreamedSequence, run_live
-from slam.commands.source import FolderSource, VideoSource, open_source
+from slam.commands.live_source import FolderSource, VideoSource, open_source
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
 from slam.sequences.camera_file import explicit_camera

@@ -16,7 +16,7 @@ import pytest
 from slam.commands.doctor import examine
 from slam.frames import Intrinsics
 from slam.runtime import imports
-from slam.runtime.errors import SequenceError
+from slam.runtime.errors import SequenceError, SlamError
 from slam.sequences.catalogue import open_sequence, sequence_names
 
 CAMERA = Intrinsics(40, 24, 30, 30, 20, 12)
@@ -288,5 +288,5 @@ def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
         raise ImportError(f"No module named {name}")
 
     monkeypatch.setattr(imports.importlib, "import_module", absent)
-    with pytest.raises(SequenceError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
+    with pytest.raises(SlamError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
         open_sequence(tmp_path / "walk.bag")

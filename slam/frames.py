@@ -1,4 +1,4 @@
-"""Data types shared by the parts of the system: frozen records, two protocols, depth between pixels.
+"""Data types shared by the parts of the system: frozen records, two protocols, depth and slopes of images.
 
 The front end, the graph and the map never import each other; ``slam/pipeline/run.py`` passes these between them.
 """
@@ -219,21 +219,6 @@ class RelativePose:
 
 
 @dataclass(frozen=True)
-class RelativeSimilarity:
-    """A measured similarity between two cameras whose units of length differ: ``p_from = scale R p_to + t``.
-
-    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of rotation and
-    translation; the last sigma is that of the logarithm of the scale.
-    """
-
-    from_index: int
-    to_index: int
-    T_from_to: FloatArray
-    scale: float
-    sigmas: FloatArray
-
-
-@dataclass(frozen=True)
 class TrackingEvent:
     """An event in the tracking of keyframes at a frame.
 
@@ -252,16 +237,6 @@ class TrackingEvent:
         what = "loops" if self.event == "map joined" else "points"
         by = "" if self.support is None else f", by {self.support} {what}"
         return f"frame {self.frame}: {self.event}{at}{by}"
-
-
-@dataclass(frozen=True)
-class MeasuredPosition:
-    """A measured ``position`` ``(3,)`` of the camera at a frame, in axes of its own, metres; ``sigmas`` ``(3,)`` are
-    along these axes."""
-
-    index: int
-    position: FloatArray
-    sigmas: FloatArray
 
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:
@@ -325,6 +300,11 @@ def resized_mask(mask: Mask, width: int, height: int) -> Mask:
     """The mask ``(height, width)`` of an image resized to so many pixels."""
     resized = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized, bool)
+
+
+def slopes_of(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
+    return [np.asarray(cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)]
 
 
 def _nearest(values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:

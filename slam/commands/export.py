@@ -24,8 +24,7 @@ from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
 from slam.frames import Intrinsics, Sequence
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.loops.places import Places
-from slam.loops.structure import PlaceStructure
+from slam.loops.places import Places, PlaceStructure
 from slam.loops.verification import OF_KEYFRAMES
 from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES

@@ -130,23 +130,12 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
     return Agreement(source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %")
 
 
-def of_images(
-    drive: Drive,
-    depth_error: DepthError,
-    focal_length: FocalLength,
-    camera: Intrinsics,
-    support: FloatArray | None,
-    contradicted: Sequence[Ends],
-    needs_road: bool,
-) -> list[Agreement]:
+def of_images(drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], needs_road: bool) -> list[Agreement]:
     """How far the images of a completed drive are from those of good drives, in the log too.
 
     Args:
         drive: all its measurements.
-        depth_error: of learned depth, by its corners.
-        focal_length: that its corners show.
         camera: that of the images.
-        support: of the frames ``(N,)``, by `frame_support`; None where maps of keyframes give the poses.
         contradicted: steps whose length learned depth or the speed before contradicts.
         needs_road: whether lengths are measured on the road.
     """
@@ -161,18 +150,20 @@ def of_images(
         figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
         figure += f", which end at frames {named([last for _, last in contradicted])}" if contradicted else ""
         found.append(("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure))
-    if support is not None and (drive.motions or drive.failures):  # else nothing was asked of the corners
+    if (support := drive.support) is not None and (
+        drive.motions or drive.failures
+    ):  # else nothing was asked of the corners
         found.append(("the overlap of images", *_overlap(support)))
     if needs_road and steps >= _LEAST:
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         found.append(("the view of the road", sigmas, figure))
-    too_far = depth_error.most_too_far(_FAR_CORNERS)
+    too_far = drive.depth_error.most_too_far(_FAR_CORNERS)
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
     agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]
-    by_corners = of_focal_length(focal_length, camera)
+    by_corners = of_focal_length(drive.focal_length, camera)
     agreements += [] if by_corners is None else [by_corners]
     return [agreements[0], *(each.said() for each in agreements[1:])]  # gaps and segments were said by their frames
 
@@ -203,15 +194,6 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     if camera.is_guess:
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
     return Agreement("the focal length", sigmas, figure) if figure else None
-
-
-def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
-    """The share of the corners that fit the motion to each frame ``(N,)``, 0 without one; the first has the next's."""
-    found: dict[int, float] = {}
-    for motion in motions:
-        found[motion.ends[1]] = max(found.get(motion.ends[1], 0.0), motion.support)
-    found[0] = found.get(1, 0.0)
-    return np.array([found.get(frame, 0.0) for frame in frames])
 
 
 def confidence(agreements: Iterable[Agreement], is_metric: bool, is_carried: bool) -> float | Failed:

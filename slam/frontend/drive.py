@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -27,6 +27,8 @@ from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
@@ -98,6 +100,7 @@ class Drive:
         ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
         ``roads`` has one entry a frame. ``unusable`` are frames without a measurement, with the reason, ``repeated``
         frames with the image of the one before, ``moving`` those of them just before which the camera moved.
+        ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as the steps have them.
         ``maps`` are those of keyframes and ``events`` what became of them; a drive measured by steps alone has none.
 
     Added by `slam.frontend.gap_interpolation.complete_drive`, which also leaves out views and keyframes of interpolated
@@ -117,6 +120,8 @@ class Drive:
     unusable: dict[int, str] = field(default_factory=dict)
     repeated: list[int] = field(default_factory=list)
     moving: list[int] = field(default_factory=list)
+    depth_error: DepthError = field(default_factory=DepthError)
+    focal_length: FocalLength = field(default_factory=FocalLength)
 
     trusted: list[SnippetPoses] = field(default_factory=list)
     interpolated: dict[int, str] = field(default_factory=dict)
@@ -145,15 +150,19 @@ class Drive:
         few = [(first, last) for first, last in runs(self.repeated) if last - first < 2 and last < len(self) - 1]
         return [k for first, last in few for k in range(first, last + 1) if k in moving]
 
+    @property
+    def support(self) -> FloatArray | None:
+        """`frame_support` of all frames ``(N,)``; None where maps of keyframes give the poses."""
+        return None if self.maps else frame_support(range(len(self)), self.motions)
+
     def last_step(self, index: int) -> Motion | None:
         """The step to one of the last frames, where image geometry measured it."""
         return next((motion for motion in self.motions[-LAST_STEPS:] if motion.ends[1] == index), None)
 
     def copy(self) -> Drive:
         """A snapshot: what is measured later is added to one of both alone."""
-        return Drive(
-            **{each.name: getattr(self, each.name).copy() for each in fields(self) if each.name != "map_poses"}
-        )
+        own: dict[str, Any] = {name: each.copy() for name, each in vars(self).items() if isinstance(each, list | dict)}
+        return replace(self, **own)
 
     def since(self, first: int) -> Drive:
         """The measurements from frame ``first`` on, which becomes frame 0; without views and keyframes.
@@ -193,6 +202,15 @@ _Between = TypeVar("_Between", RelativePose, RelativeRotation)
 
 def _moved(measured: _Between, first: int) -> _Between:
     return replace(measured, from_index=measured.from_index - first, to_index=measured.to_index - first)
+
+
+def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
+    """The share of the corners that fit the motion to each frame ``(N,)``, 0 without one; the first has the next's."""
+    found: dict[int, float] = {}
+    for motion in motions:
+        found[motion.ends[1]] = max(found.get(motion.ends[1], 0.0), motion.support)
+    found[0] = found.get(1, 0.0)
+    return np.array([found.get(frame, 0.0) for frame in frames])
 
 
 def named(frames: Collection[int]) -> str:

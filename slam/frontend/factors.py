@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose
+from slam.frames import KEYFRAME_SOURCE, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, join_gap_ends
+from slam.frontend.gap_interpolation import join_gap_ends
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
@@ -20,17 +20,20 @@ from slam.frontend.network_factors import (
     network_steps,
 )
 from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.visual.motion import Steps, links, triangulated
-from slam.frontend.visual.step_noise import inflate_step_sigmas
+from slam.frontend.visual.motion import Steps, triangulated
+from slam.frontend.visual.step_noise import step_noise
 from slam.geometry.se3 import FloatArray, compose, rigid
 
 logger = logging.getLogger(__name__)
 
 
-def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[RelativePose]:
+def make_factors(
+    drive: Drive, scale: Scale, lidar_steps: Sequence[RelativePose] = (), level: int = logging.INFO
+) -> list[RelativePose]:
     """All relative poses of a completed drive with their noise, in the unit of the scale.
 
-    What the pose network measured is a line in the log of this ``level``.
+    The least certain come first, and odometry is chained by the last ones; steps by LiDAR, in metres, stand before
+    those of image geometry. What the pose network measured is a line in the log of this ``level``.
     """
     maps = drive.map_poses
     geometric = _geometric(drive.steps, scale)
@@ -47,14 +50,7 @@ def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[
         [pose for pose in poses if not maps.is_inside(pose)] for poses in (networks, interpolated, geometric)
     )
     interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
-    return [*by_network, *interpolated, *by_image, *by_keyframes]
-
-
-def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
-    """The factors with LiDAR steps, all in metres, before those of image geometry, by which odometry is chained."""
-    less_certain = (NETWORK_SOURCE, INTERPOLATED_SOURCE)
-    before = [factor for factor in factors if factor.source in less_certain]
-    return [*before, *lidar_steps, *(factor for factor in factors if factor.source not in less_certain)]
+    return [*by_network, *interpolated, *lidar_steps, *by_image, *by_keyframes]
 
 
 def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:
@@ -93,7 +89,7 @@ def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
 
 def _geometric(steps: Steps, scale: Scale) -> list[RelativePose]:
     """Every step of image geometry: with its own length where that was measured, else by learned depth."""
-    noise = _step_noise(steps, scale)
+    noise = step_noise(triangulated(steps), len(scale.per_frame))
     factors = []
     for ends, motion in steps.items():
         length = scale.lengths.get(ends)
@@ -103,13 +99,3 @@ def _geometric(steps: Steps, scale: Scale) -> list[RelativePose]:
         pose = motion.with_length(*length, noise[ends])
         factors.append(replace(pose, student_t_dof=STUDENT_T_DOF))
     return factors
-
-
-def _step_noise(steps: Steps, scale: Scale) -> Mapping[Ends, FloatArray]:
-    """Sigmas ``(6,)`` of the triangulated steps besides that of the corners, by their order in the drive."""
-    motions = triangulated(steps)
-    place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}
-    T_by_place = {n: motions[ends].relative_pose.T_from_to for ends, n in place.items()}
-    own = {n: motions[ends].corner_sigmas for ends, n in place.items()}
-    inflated = inflate_step_sigmas(T_by_place, own)
-    return {ends: inflated[n] for ends, n in place.items()}

@@ -15,7 +15,7 @@ from slam.frontend.drive import Drive, Segment
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
 from slam.frontend.network_factors import calibrate_network, network_steps
 from slam.frontend.rotation_smoothing import smooth_rotations
-from slam.frontend.scale.road_slope import with_slope
+from slam.frontend.scale.road_homography import with_slope
 from slam.frontend.visual.motion import Motion, Steps
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError

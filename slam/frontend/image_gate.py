@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Frame, Grey, Mask
+from slam.frames import Frame, Grey, Mask, slopes_of
 from slam.runtime.errors import Failed
 
 _THUMBNAIL = (32, 16)  # width, height
@@ -133,8 +133,3 @@ def _difference(before: _Layer, now: _Layer) -> float:
     difference -= difference.mean()
     gradient = float(np.hypot(*slopes_of(before)).mean())
     return float(np.abs(difference).mean()) / max(gradient, _LEAST_GRADIENT)
-
-
-def slopes_of(layer: _Layer) -> list[_Layer]:
-    """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
-    return [np.asarray(cv2.Sobel(layer, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)]

@@ -1,1 +1,1 @@
-"""Rigid transforms, robust statistics, camera poses from points, points from cameras, the earth."""
+"""Rigid transforms, robust statistics, camera poses from points, the earth."""

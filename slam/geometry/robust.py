@@ -27,11 +27,6 @@ def mad_sigma(residuals: NDArray[np.floating[Any]]) -> float:
     return MAD_TO_SIGMA * median(np.abs(residuals))
 
 
-def mad_sigmas(residuals: FloatArray) -> FloatArray:
-    """The same of each column of residuals ``(N, K)``, ``(K,)``."""
-    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(residuals), axis=0))
-
-
 def weighted_median(values: FloatArray, weights: FloatArray) -> float:
     """The value ``(N,)`` at which half of the weight ``(N,)`` is reached."""
     order = np.argsort(values)

@@ -13,12 +13,13 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from slam.formats.g2o import write_g2o
-from slam.frames import LOOP_SOURCE, MeasuredPosition, RelativePose
+from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry.se3 import FloatArray, invert, is_se3
 from slam.runtime.errors import SlamError
 
@@ -35,34 +36,25 @@ logger = logging.getLogger(__name__)
 
 
 class PoseGraph:
-    """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 is fixed as the world frame."""
+    """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 is fixed as the world frame.
+
+    Attributes:
+        relative_poses: the factors in use, in the order they were added.
+        dropped: loop factors dropped: the system was singular with them, or they contradict the rest.
+        T_fixed_world: ``(4, 4)``: the world in the axes of the measured positions; the identity without any.
+    """
 
     def __init__(self) -> None:
-        self._relative_poses: list[RelativePose] = []
-        self._dropped: list[RelativePose] = []
+        self.relative_poses: list[RelativePose] = []
+        self.dropped: list[RelativePose] = []
+        self.T_fixed_world: FloatArray = np.eye(4)
         self._T_world_camera: FloatArray | None = None
-        self._positions: tuple[MeasuredPosition, ...] = ()
-        self._T_fixed_world: FloatArray = np.eye(4)
-
-    @property
-    def T_fixed_world(self) -> FloatArray:
-        """``(4, 4)``: the world in the axes of the measured positions; the identity without any."""
-        return self._T_fixed_world.copy()
-
-    @property
-    def relative_poses(self) -> tuple[RelativePose, ...]:
-        """The factors in use, in the order they were added."""
-        return tuple(self._relative_poses)
-
-    @property
-    def dropped(self) -> tuple[RelativePose, ...]:
-        """Loop factors dropped: the system was singular with them, or they contradict the rest."""
-        return tuple(self._dropped)
+        self._positions: list[tuple[int, FloatArray, FloatArray]] = []  # frame, position, sigmas
 
     @property
     def errors(self) -> FloatArray:
         """Whitened squared residual ``(F,)`` of each factor at the optimised trajectory."""
-        return whitened_squared(self._relative_poses, self._solution())
+        return whitened_squared(self.relative_poses, self._solution())
 
     def add_relative(self, *relative_poses: RelativePose) -> None:
         """Add measurements as factors.
@@ -72,11 +64,17 @@ class PoseGraph:
         """
         for relative_pose in relative_poses:
             _check(relative_pose)
-        self._relative_poses += relative_poses
+        self.relative_poses += relative_poses
 
-    def add_positions(self, positions: Sequence[MeasuredPosition], T_fixed_world_initial: FloatArray) -> None:
-        """Add positions measured in axes in which the world lies about at ``T_fixed_world_initial`` ``(4, 4)``."""
-        self._positions, self._T_fixed_world = tuple(positions), T_fixed_world_initial
+    def add_positions(
+        self, frames: NDArray[np.intp], positions: FloatArray, sigmas: FloatArray, T_fixed_world_initial: FloatArray
+    ) -> None:
+        """Add positions ``(M, 3)`` at ``frames`` ``(M,)``, metres, with ``sigmas`` ``(M, 3)`` along their axes.
+
+        The world lies about at ``T_fixed_world_initial`` ``(4, 4)`` in these axes.
+        """
+        self._positions += zip(frames.tolist(), positions, sigmas, strict=True)
+        self.T_fixed_world = T_fixed_world_initial
 
     def optimise(self, T_world_camera_initial: FloatArray) -> FloatArray:
         """Solve for all poses from an initial trajectory; the first pose is fixed.
@@ -90,7 +88,7 @@ class PoseGraph:
         Raises:
             SlamError: if frames are not connected or the system cannot be solved.
         """
-        _check_connected(self._relative_poses, len(T_world_camera_initial))
+        _check_connected(self.relative_poses, len(T_world_camera_initial))
         if not is_se3(T_world_camera_initial):
             raise SlamError("the initial trajectory of the pose graph must be finite rigid transforms")
         for _ in range(_MAX_DROPPED_LOOPS + 1):
@@ -100,8 +98,8 @@ class PoseGraph:
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
                 reason = str(error).strip().partition("\n")[0]
                 self._drop_newest_loop(reason)
-                _check_connected(self._relative_poses, len(T_world_camera_initial))
-        raise SlamError(f"the pose graph cannot be solved even without {len(self._dropped)} loop edges")
+                _check_connected(self.relative_poses, len(T_world_camera_initial))
+        raise SlamError(f"the pose graph cannot be solved even without {len(self.dropped)} loop edges")
 
     def drop_contradicted_loops(self) -> tuple[RelativePose, ...]:
         """Drop the loops with a large residual at the optimised trajectory while most others have a small one.
@@ -113,15 +111,15 @@ class PoseGraph:
             The loops dropped; where there are any, optimise again.
         """
         squared = self.errors
-        is_loop = np.array([edge.source == LOOP_SOURCE for edge in self._relative_poses], dtype=bool)
+        is_loop = np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
         if not is_loop.any():
             return ()
         typical = float(np.median(np.sqrt(squared[is_loop])))
         limit = max(_LARGEST_LOOP_RESIDUAL, _OUTLYING * typical)
         beyond = is_loop & (squared > limit**2)
-        gone = tuple(edge for edge, out in zip(self._relative_poses, beyond, strict=True) if out)
-        self._relative_poses = [edge for edge, out in zip(self._relative_poses, beyond, strict=True) if not out]
-        self._dropped += gone
+        gone = tuple(edge for edge, out in zip(self.relative_poses, beyond, strict=True) if out)
+        self.relative_poses = [edge for edge, out in zip(self.relative_poses, beyond, strict=True) if not out]
+        self.dropped += gone
         return gone
 
     def marginal(self, frame: int) -> FloatArray:
@@ -141,7 +139,7 @@ class PoseGraph:
 
     def write_g2o(self, path: Path) -> None:
         """Write the optimised graph in g2o's text format at full precision, atomically."""
-        write_g2o(path, self._relative_poses, self._solution())
+        write_g2o(path, self.relative_poses, self._solution())
 
     def _solution(self) -> FloatArray:
         if self._T_world_camera is None:
@@ -149,54 +147,48 @@ class PoseGraph:
         return self._T_world_camera
 
     def _solve(self, T_world_camera_initial: FloatArray) -> FloatArray:
-        values = self._minimise(self._values(T_world_camera_initial))
-        T_fixed_camera = np.stack([values.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
+        values = self._values(T_world_camera_initial)
+        graph, parameters = self._factors(values), gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(_MAX_ITERATIONS)
+        parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        solved = optimiser.optimize()
+        errors = graph.error(values), optimiser.error()
+        count, iterations = len(self.relative_poses), optimiser.iterations()
+        logger.info("pose graph: %d factors, error %.4g to %.4g in %d iterations", count, *errors, iterations)
+        T_fixed_camera = np.stack([solved.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
         if not np.isfinite(T_fixed_camera).all():
             raise RuntimeError("the solution is not finite")
         T_fixed_camera[:, :3, :3] = Rotation.from_matrix(T_fixed_camera[:, :3, :3]).as_matrix()
         rebased: FloatArray = T_world_camera_initial[0] @ invert(T_fixed_camera[0]) @ T_fixed_camera
         if self._positions:
-            self._T_fixed_world = T_fixed_camera[0] @ invert(T_world_camera_initial[0])
+            self.T_fixed_world = T_fixed_camera[0] @ invert(T_world_camera_initial[0])
         rebased[0] = T_world_camera_initial[0]
         return rebased
 
     def _values(self, T_world_camera: FloatArray) -> Any:
         values = gtsam.Values()
-        for k, T in enumerate(self._T_fixed_world @ T_world_camera):
+        for k, T in enumerate(self.T_fixed_world @ T_world_camera):
             values.insert(k, _pose3(T))
         return values
 
     def _factors(self, values: Any) -> Any:
         graph = gtsam.NonlinearFactorGraph()
-        graph.add(_anchor(values.atPose3(0), is_loose=bool(self._positions)))
-        for edge in self._relative_poses:
-            graph.add(_between(edge))
-        for position in self._positions:
-            graph.add(_position(position))
+        sigmas = _LOOSE_SIGMAS if self._positions else np.full(6, _ANCHOR_SIGMA)
+        graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        for edge in self.relative_poses:
+            noise = robust_noise(edge.graph_sigmas)
+            graph.add(gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise))
+        for frame, position, own in self._positions:
+            graph.add(gtsam.GPSFactor(frame, position, robust_noise(own)))
         return graph
 
-    def _minimise(self, values: Any) -> Any:
-        graph = self._factors(values)
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(_MAX_ITERATIONS)
-        parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)
-        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-        solved = optimiser.optimize()
-        logger.info(
-            "pose graph: %d factors, error %.4g to %.4g in %d iterations",
-            len(self._relative_poses),
-            graph.error(values),
-            optimiser.error(),
-            optimiser.iterations(),
-        )
-        return solved
-
     def _drop_newest_loop(self, reason: str) -> None:
-        loops = [k for k, edge in enumerate(self._relative_poses) if edge.source == LOOP_SOURCE]
+        loops = [k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE]
         if not loops:
             raise SlamError(f"the pose graph cannot be solved: {reason}")
-        edge = self._relative_poses.pop(loops[-1])
-        self._dropped.append(edge)
+        edge = self.relative_poses.pop(loops[-1])
+        self.dropped.append(edge)
         logger.warning("loop %d -> %d dropped from the graph: %s", edge.from_index, edge.to_index, reason)
 
 
@@ -221,22 +213,8 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
         raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
 
 
-def _anchor(pose: Any, is_loose: bool = False) -> Any:
-    sigmas = _LOOSE_SIGMAS if is_loose else np.full(6, _ANCHOR_SIGMA)
-    return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-
-
-def _between(edge: RelativePose) -> Any:
-    noise = _noise(edge.graph_sigmas)
-    return gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise)
-
-
-def _position(measured: MeasuredPosition) -> Any:
-    noise = _noise(measured.sigmas)
-    return gtsam.GPSFactor(measured.index, measured.position, noise)
-
-
-def _noise(sigmas: FloatArray) -> Any:
+def robust_noise(sigmas: FloatArray) -> Any:
+    """GTSAM's model of independent errors with these sigmas and Huber's loss."""
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
 

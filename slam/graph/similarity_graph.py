@@ -7,19 +7,34 @@ as ``p -> s (R p + t)``.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.frames import RelativeSimilarity
 from slam.geometry.se3 import FloatArray, make
+from slam.graph.pose_graph import robust_noise
 from slam.runtime.errors import SlamError
 
 _ANCHOR_SIGMA = 1e-6
-_HUBER = 1.345
 _MOST_ITERATIONS = 100
+
+
+@dataclass(frozen=True)
+class RelativeSimilarity:
+    """A measured similarity between two cameras whose units of length differ: ``p_from = scale R p_to + t``.
+
+    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of rotation and
+    translation; the last sigma is that of the logarithm of the scale.
+    """
+
+    from_index: int
+    to_index: int
+    T_from_to: FloatArray
+    scale: float
+    sigmas: FloatArray
 
 
 def optimise_similarities(
@@ -45,9 +60,7 @@ def optimise_similarities(
     graph.add(gtsam.PriorFactorSimilarity3(0, values.atSimilarity3(0), fixed))
     for edge in edges:
         units = np.concatenate([np.ones(3), np.full(3, edge.scale), np.ones(1)])
-        noise: Any = gtsam.noiseModel.Diagonal.Sigmas(edge.sigmas / units)
-        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(_HUBER), noise)
-        measured = _similarity(edge.T_from_to, edge.scale)
+        measured, noise = _similarity(edge.T_from_to, edge.scale), robust_noise(edge.sigmas / units)
         graph.add(gtsam.BetweenFactorSimilarity3(edge.from_index, edge.to_index, measured, noise))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_MOST_ITERATIONS)

@@ -9,23 +9,12 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide, RefinedDepth, measure
 from erfsfm.mvs.views import Appearance, neighbours_around
-from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 
 _REMEMBERED = 24
-
-
-def decision(config: DepthConfig) -> Decide | None:
-    """What decides between learned and measured depth; None where depth is not refined.
-
-    Raises:
-        CheckpointError: ``config.fusion`` names no network that can be read.
-    """
-    return DepthFusion(config.fusion).decide if config.refine == "learned" else None
 
 
 class DepthRefiner:
@@ -41,13 +30,18 @@ class DepthRefiner:
     ) -> None:
         """Keyframes of these frame numbers, ascending, at poses ``(K, 4, 4)`` in the unit of the depths to come.
 
-        ``image`` gives that of the n-th keyframe, of these intrinsics; ``decide`` is of `decision`.
+        ``image`` gives that of the n-th keyframe, of these intrinsics; ``decide`` chooses learned or measured depth.
         """
         self._intrinsics = intrinsics
         self._indices = np.asarray(indices)
         self._T_world_camera = T_world_camera
         self._decide = decide
-        self._appearance = lru_cache(maxsize=_REMEMBERED)(lambda n: _appearance(image(n)))
+
+        @lru_cache(maxsize=_REMEMBERED)
+        def appearance(n: int) -> Appearance:
+            return Appearance.of(np.asarray(cv2.cvtColor(image(n), cv2.COLOR_RGB2GRAY), np.uint8))
+
+        self._appearance = appearance
 
     def refine(self, n: int, depth: DepthMap) -> RefinedDepth | None:
         """The n-th keyframe's metric depth ``(H, W)``, refined; None where no neighbour is at a useful distance.
@@ -70,7 +64,3 @@ class DepthRefiner:
         refined = self._decide(measurement)
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
         return refined
-
-
-def _appearance(image: Image) -> Appearance:
-    return Appearance.of(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8))

@@ -14,11 +14,10 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply
 from slam.frames import Intrinsics
-from slam.geometry.se3 import FloatArray
 from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
-from slam.mapping.views import ViewChooser, moved_rows
+from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpillFile
 
@@ -26,7 +25,6 @@ _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the r
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
 _SUBMAP_LENGTH = 3.0  # largest depths after which a submap ends: 60 m of a street
 _EARLIER = 3  # views between one and that which tells what has come since
-_KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 
 
 class TsdfMap:
@@ -63,15 +61,6 @@ class TsdfMap:
         self._fuse_waiting(view)
         self._waiting = view
 
-    def select(self, frames: Sequence[int], T_world_camera: FloatArray) -> list[int]:
-        """The frames to integrate, before each of which the camera has moved, as positions in ``frames``.
-
-        Args:
-            frames: frame numbers in time order.
-            T_world_camera: poses of all frames ``(N, 4, 4)``.
-        """
-        return moved_rows(T_world_camera[list(frames)], self._config.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)
-
     def surface(self, progress: Progress = silent) -> MapSurface:
         """The surface of all that was fused; more depth maps may follow.
 
@@ -87,7 +76,7 @@ class TsdfMap:
             )
         if self._surface is None:
             self._finish_submap()
-            self._surface = MapSurface(self._finished, self._fused, self._config, progress)
+            self._surface = MapSurface(self._finished, self._config, progress)
         return self._surface
 
     def mesh(self) -> Ply:

@@ -132,15 +132,6 @@ class Fusion:
         return keys[order], np.packbits(seen, axis=1), tsdf.astype(np.float16), weights
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """Merged blocks: coordinates ``(B, 3)``, distances ``(B, 4096)`` in truncation distances, weights ``(B, 4096)``."""
-
-    keys: Keys
-    tsdf: NDArray[np.float32]
-    weight: NDArray[np.float32]
-
-
 class MergedSubmaps:
     """Submaps on disk; of each the block coordinates and the views' poses stay in memory."""
 
@@ -164,8 +155,11 @@ class MergedSubmaps:
         """Number of different blocks."""
         return len(np.unique(np.concatenate(self._keys), axis=0))
 
-    def merged(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> Blocks:
-        """Blocks with ``low <= key < high``: the weighted means of the blocks of all submaps."""
+    def merged(self, low: Keys, high: Keys) -> tuple[Keys, NDArray[np.float32], NDArray[np.float32]]:
+        """Blocks with ``low <= key < high``: the weighted means of the blocks of all submaps.
+
+        Coordinates ``(B, 3)``, distances ``(B, 4096)`` in truncation distances, and weights ``(B, 4096)``.
+        """
         inside = [np.asarray(((keys >= low) & (keys < high)).all(axis=1)) for keys in self._keys]
         keys = np.unique(np.concatenate([own[mask] for own, mask in zip(self._keys, inside)]), axis=0)
         weight = np.zeros((len(keys), BLOCK_VOXELS), np.float32)
@@ -182,7 +176,7 @@ class MergedSubmaps:
             own[observed] *= submap.tsdf[places]
             total[rows] += own
         np.divide(total, weight, out=total, where=weight > 0)
-        return Blocks(keys, total, weight)
+        return keys, total, weight
 
 
 def _rows(keys: Keys, wanted: Keys, low: Keys, high: Keys) -> NDArray[np.intp]:

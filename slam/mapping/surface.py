@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -65,16 +66,14 @@ class _Rows:
 class MapSurface:
     """The cleaned surface of finished submaps."""
 
-    def __init__(
-        self, finished: Sequence[SpilledSubmap], fused: int, config: MappingConfig, progress: Progress = silent
-    ) -> None:
-        """Merge the submaps of so many fused frames and extract their surface.
+    def __init__(self, finished: Sequence[SpilledSubmap], config: MappingConfig, progress: Progress = silent) -> None:
+        """Merge the submaps and extract their surface.
 
         Raises:
             EmptyMapError: nothing was fused or seen often enough.
             SlamError: the disk is full.
         """
-        if fused == 0:
+        if not finished:
             raise EmptyMapError("the map is empty: no depth passed the filters")
         submaps = MergedSubmaps(finished)
         self._spill = SpillFile("the map")
@@ -101,11 +100,7 @@ class MapSurface:
     def cloud_pieces(self) -> Iterator[NDArray[np.void]]:
         """The observed vertices, without the ones that close holes, as records."""
         for vertices in self.vertex_pieces():
-            observed = vertices[vertices["filled"] == 0]
-            cloud = np.empty(len(observed), VERTEX)
-            for name in VERTEX.names or ():
-                cloud[name] = observed[name]
-            yield cloud
+            yield repack_fields(vertices[vertices["filled"] == 0][[*(VERTEX.names or ())]])
 
     def triangle_pieces(self) -> Iterator[Triangles]:
         """Triangles ``(t, 3)`` of all vertices, tile by tile."""

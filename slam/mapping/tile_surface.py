@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
-from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, Blocks, MergedSubmaps, new_grid
+from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, Keys, MergedSubmaps, new_grid
 from slam.runtime.imports import import_open3d
 
 Triangles = NDArray[np.int64]
@@ -47,7 +47,7 @@ def extract_tile(
     belongs to the tile that its centre is in.
     """
     low = tile * TILE_BLOCKS
-    mesh = _extract(submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m, least_weight)
+    mesh = _extract(*submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m, least_weight)
     if mesh is None:
         return None
     vertices, triangles = _sorted(*mesh)
@@ -63,12 +63,14 @@ def in_tile(points: FloatArray, tile: NDArray[np.int64], voxel_size_m: float) ->
     return np.asarray((np.floor(points / side) == tile).all(axis=1))
 
 
-def _extract(blocks: Blocks, voxel_size_m: float, least_weight: float) -> tuple[FloatArray, Triangles] | None:
+def _extract(
+    keys: Keys, tsdf: NDArray[np.float32], weight: NDArray[np.float32], voxel_size_m: float, least_weight: float
+) -> tuple[FloatArray, Triangles] | None:
     o3d = import_open3d()
-    grid: Any = new_grid(voxel_size_m, len(blocks.keys))
-    places, _ = grid.hashmap().activate(o3d.core.Tensor(blocks.keys.astype(np.int32)))
-    shape = (len(blocks.keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 1)
-    for name, values in (("tsdf", blocks.tsdf), ("weight", blocks.weight)):
+    grid: Any = new_grid(voxel_size_m, len(keys))
+    places, _ = grid.hashmap().activate(o3d.core.Tensor(keys.astype(np.int32)))
+    shape = (len(keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 1)
+    for name, values in (("tsdf", tsdf), ("weight", weight)):
         grid.attribute(name).numpy()[places.numpy()] = values.reshape(shape)
     try:
         # a frame weighs 1

@@ -9,7 +9,7 @@ from slam.frames import Sequence, runs
 from slam.frontend.drive import DOUBLED, Drive, named
 from slam.frontend.image_gate import ImageGate
 from slam.frontend.lidar_odometry import has_scans
-from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
+from slam.frontend.scale.metric_scale import known_frames, resolve_mode
 from slam.runtime.errors import SlamError
 from slam.sequences.recording import GrowingSequence
 
@@ -68,7 +68,24 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
         known_frames(config.scale, sequence.stamps)
 
 
-def warn_of_doubts(drive: Drive, gate: ImageGate) -> None:
+def warn_of_images(gate: ImageGate) -> None:
+    """Warn of an exposure that rolls, and of a part of the image that does not show the world."""
+    if gate.compared >= _LEAST_COMPARED and gate.exposed > _ROLLING_EXPOSURE * gate.compared:
+        logger.warning(
+            "the exposure rolls: %d of %d images are more than a tenth brighter or darker than the one before; fix the "
+            "exposure, or its flicker under lamps",
+            gate.exposed,
+            gate.compared,
+        )
+    if gate.standing is not None and gate.standing.mean() > _LEAST_STANDING:
+        logger.warning(
+            "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
+            "road is taken from there",
+            100 * gate.standing.mean(),
+        )
+
+
+def warn_of_doubts(drive: Drive) -> None:
     """Warn of gaps, of segments, whose places are guesses, and of a frozen end: did the camera stand there?"""
     gaps, later, doubled = drive.interpolated, drive.segments[1:], drive.doubled
     if gaps:
@@ -83,19 +100,6 @@ def warn_of_doubts(drive: Drive, gate: ImageGate) -> None:
         )
     if doubled:
         logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named(doubled))
-    if gate.compared >= _LEAST_COMPARED and gate.exposed > _ROLLING_EXPOSURE * gate.compared:
-        logger.warning(
-            "the exposure rolls: %d of %d images are more than a tenth brighter or darker than the one before; fix the "
-            "exposure, or its flicker under lamps",
-            gate.exposed,
-            gate.compared,
-        )
-    if gate.standing is not None and gate.standing.mean() > _LEAST_STANDING:
-        logger.warning(
-            "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
-            "road is taken from there",
-            100 * gate.standing.mean(),
-        )
     end = len(drive) - 1
     for first, last in runs(drive.repeated):
         if last == end and end not in drive.interpolated:

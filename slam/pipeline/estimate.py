@@ -11,15 +11,14 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics, RelativePose, View
 from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
+from slam.frontend.gps import Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
 from slam.mapping.map import TsdfMap
-from slam.pipeline.positioning import Location
 from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch
 
@@ -48,11 +47,9 @@ class Estimate:
     """Trajectories with one row a frame, the factors and loops they fit, the graph, and the map once it is fused.
 
     ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
-    ``depth_error`` is that of learned depth, as the steps of the drive show it.
     ``graph`` is the reason where it has no solution: the optimised trajectory then is the odometry.
     ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
-    each optional source contradicts the images, ``confidence`` what follows from all of them, or why nothing does;
-    ``support`` ``(N,)`` is that of the motion to each frame, None where maps of keyframes give the poses.
+    each optional source contradicts the images, ``confidence`` what follows from all of them, or why nothing does.
     """
 
     network: Trajectory
@@ -61,7 +58,6 @@ class Estimate:
     lidar: LidarPath | Failed | None
     reference: Trajectory | None
     drive: Drive
-    depth_error: DepthError
     scale: Scale
     factors: list[RelativePose]
     views: list[View]
@@ -70,7 +66,6 @@ class Estimate:
     location: Location | Failed | None
     stopwatch: Stopwatch
     confidence: float | Failed
-    support: FloatArray | None
     agreements: Sequence[Agreement] = ()
     map: TsdfMap | None = None
 

@@ -18,11 +18,13 @@ from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
+from slam.mapping.views import moved_rows
 from slam.pipeline.estimate import Estimate
 
 # relative sigma of learned depth in rooms, in the unit of the drive: 90 % of the errors are within 1.645 sigmas
 _ROOM_SIGMA = 0.32
 _SOME = 20
+_KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 _STREET_DEPTH_M = 15.0  # median depth of a street
 
 
@@ -36,26 +38,18 @@ def fuse(
 ) -> TsdfMap:
     """Learned depth at the optimised poses, refined and fused into one surface.
 
-    A camera that is carried turns on the spot, where nothing measures learned depth. The error of that over
-    distance is known by steps, which measure only the first frames there, and is not taken out. ``decide`` is between
-    learned and measured depth, None where it is not refined; ``compare`` is called with each keyframe's depth.
+    ``decide`` is between learned and measured depth, None where it is not refined; ``compare`` is called with each
+    keyframe's depth.
     """
     drive, scales, T_world_camera = estimate.drive, estimate.scale.per_frame, estimate.optimised.T_world_camera
     height, width = drive.keyframes[0].depth_unscaled.shape
     intrinsics = intrinsics.resized(width, height)
-    is_carried = bool(drive.maps)
-    depth_at = keyframe_depths(
-        drive,
-        scales,
-        T_world_camera,
-        DepthError() if is_carried else estimate.depth_error,
-        intrinsics,
-        decide,
-        _ROOM_SIGMA if is_carried and config.depth.is_learned else None,
-    )
+    guess_sigma = _ROOM_SIGMA if drive.maps and config.depth.is_learned else None
+    depth_at = keyframe_depths(drive, scales, T_world_camera, intrinsics, decide, guess_sigma)
     mapping = config.mapping if estimate.scale.is_metric else fitted(config.mapping, drive, scales)
     tsdf_map = TsdfMap(mapping, intrinsics)
-    selected = tsdf_map.select([keyframe.index for keyframe in drive.keyframes], T_world_camera)
+    T_keyframes = T_world_camera[[keyframe.index for keyframe in drive.keyframes]]
+    selected = moved_rows(T_keyframes, mapping.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)
     with closing(read_ahead(depth_at, selected, CORES)) as ahead:
         for done, keyframe in enumerate(estimate.stopwatch.each("depth refinement", ahead), 1):
             compare(keyframe)
@@ -81,17 +75,18 @@ def keyframe_depths(
     drive: Drive,
     scale_per_frame: FloatArray,
     T_world_camera: FloatArray,
-    error: DepthError,
     intrinsics: Intrinsics,
     decide: Decide | None,
     guess_sigma: float | None,
 ) -> Callable[[int], KeyframeDepth]:
     """The depth of the n-th keyframe of a drive in the unit of the trajectory, as a function of n.
 
-    The ``error`` of learned depth is taken out first; ``scale_per_frame`` ``(N,)`` and ``T_world_camera`` ``(N, 4, 4)``
-    are of all frames. ``guess_sigma`` is that of depth that was to be refined and has no neighbours, None for none.
+    The error of learned depth is taken out first. A camera that is carried turns on the spot, where nothing measures
+    learned depth: its error over distance is known by steps, which measure only the first frames there, and stays.
+    ``scale_per_frame`` ``(N,)`` and ``T_world_camera`` ``(N, 4, 4)`` are of all frames. ``guess_sigma`` is that of
+    depth that was to be refined and has no neighbours, None for none.
     """
-    keyframes, refiner = drive.keyframes, None
+    keyframes, refiner, error = drive.keyframes, None, DepthError() if drive.maps else drive.depth_error
     if decide is not None:
         indices = [keyframe.index for keyframe in keyframes]
         refiner = DepthRefiner(intrinsics, indices, T_world_camera[indices], lambda n: keyframes[n].image, decide)

@@ -11,19 +11,14 @@ import numpy as np
 
 from erfsfm.common.threads import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
-from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
+from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent
 from slam.frontend.drive import LAST_STEPS, Drive
 from slam.frontend.keyframes.local_map import LocalMap, MapSegment
-from slam.frontend.keyframes.odometry import MAX_CORNERS, KeyframeOdometry
+from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.parts import parts_of
 from slam.frontend.keyframes.unit import learned_unit
-from slam.frontend.scale.road_plane import GroundPlane
-from slam.frontend.tracking import new_corners
+from slam.frontend.scale.road_plane import height_of
 from slam.geometry.se3 import FloatArray, invert
-from slam.loops.descriptors import describe
-from slam.loops.relocalisation import Relocaliser
-from slam.pipeline.map_closure import views_of
-from slam.runtime.errors import Failed
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
@@ -65,15 +60,12 @@ class KeyframeTracking:
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
         """Prepare for the first frame; ``on_keyframe`` is told of a keyframe before it is adjusted."""
-        self._config, self._loops, self._intrinsics, self._seed = config, loops, intrinsics, seed
-        self._camera_height_m = camera_height_m
-        self._lost: MapSegment | None = None
-        self._places: Relocaliser | None = None  # of the lost map
+        self._config, self._intrinsics, self._camera_height_m = config, intrinsics, camera_height_m
         self._front_end: FrontEnd = "both"
         self._cores = ExitStack()
         # the networks, which predict little for keyframes, leave their core to optical flow
         self._cores.enter_context(opencv_threads(usable_cores()))
-        self._odometry: KeyframeOdometry | None = KeyframeOdometry(intrinsics, seed, on_keyframe)
+        self._odometry: KeyframeOdometry | None = KeyframeOdometry(intrinsics, seed, on_keyframe, loops.enabled)
         self.choose(Drive())
 
     @property
@@ -87,39 +79,14 @@ class KeyframeTracking:
         return () if self._odometry is None else self._odometry.events
 
     def follow(self, frame: Frame) -> None:
-        """Track the next usable frame; a lost camera is looked for among the keyframes of its map."""
-        if self._odometry is None:
-            return
-        self._odometry.follow(frame)
-        lost = self._odometry.lost_map()
-        if lost is not self._lost:  # a map that begins may be lost with the next frame
-            self._lost, self._places = lost, None
-        if lost is not None and self._loops.enabled:
-            self._relocalise(self._odometry, lost.map, frame)
+        """Track the next usable frame."""
+        if self._odometry is not None:
+            self._odometry.follow(frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned depth ``(H, W)`` of the frame that was followed last."""
         if self._odometry is not None:
             self._odometry.learn(frame, depth)
-
-    def _relocalise(self, odometry: KeyframeOdometry, lost: LocalMap, frame: Frame) -> None:
-        """Look for the camera among all keyframes of the map in which it was lost."""
-        if self._places is None:
-            T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
-            self._places = Relocaliser(
-                views_of(lost.keyframes, lost.points), T_map_camera, self._intrinsics, self._seed
-            )
-        corners = new_corners(frame.grey, np.zeros((0, 2), np.float32), MAX_CORNERS)
-        unknown = np.full((len(corners), 3), np.nan, np.float32)
-        found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
-        if found is None:
-            return
-        seen = zip(found.keyframes.tolist(), found.keyframe_corners.tolist(), strict=True)
-        tracks = np.array([lost.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen])
-        tracks, first = np.unique(tracks, return_index=True)
-        place = lost.keyframes[found.nearest].index
-        odometry.relocalise(frame, found.T_camera_map, tracks, corners[found.corners[first]], place)
-        self._places = None  # the new keyframe changes the map
 
     def choose(self, drive: Drive) -> None:
         """Choose what measures the frames that follow, until that is one of both."""
@@ -186,8 +153,3 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
     if len(first) < _MOST_STEPS and not is_clear:
         return None
     return is_fast and scatter_deg < _VEHICLE_SCATTER_DEG
-
-
-def height_of(road: GroundPlane | Failed) -> float | None:
-    """The camera's height over the ground plane of a frame, unscaled; None without one."""
-    return road.height_unscaled if isinstance(road, GroundPlane) else None

@@ -15,7 +15,7 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
-from slam.loops.structure import PlaceStructure
+from slam.loops.places import PlaceStructure
 from slam.loops.verification import OF_KEYFRAMES
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.live_poses import LivePose, LivePoses
@@ -167,7 +167,7 @@ class Slam:
         self._observer.flush()
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        estimate = self._pipeline.solve(self._observer.observations(), Recorder())
+        estimate = self._pipeline.solve(self._observer.measured(), Recorder())
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         self._estimate = estimate
         return estimate.loops

@@ -9,12 +9,10 @@ from typing import Literal
 import numpy as np
 
 from slam.config.sections import SlamConfig
-from slam.frontend.agreement import frame_support
-from slam.frontend.drive import LAST_STEPS
+from slam.frontend.drive import LAST_STEPS, frame_support
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import complete_drive
-from slam.frontend.scale.metric_scale import Scale, find_scale
-from slam.frontend.scale.scale_estimate import resolve_mode
+from slam.frontend.scale.metric_scale import Scale, find_scale, resolve_mode
 from slam.geometry.se3 import FloatArray, compose, invert
 from slam.pipeline.observer import Observer
 
@@ -51,7 +49,6 @@ class LivePoses:
         self._mode = resolve_mode(config.scale, camera_height_m)
         self.unit_name: str | None = None  # of all lengths, None while unknown
         self._T_world_camera: list[FloatArray] = []
-        self._T_previous_newest = np.eye(4)
         self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
         self._was_bridged = False
         self._settled = 0  # the last frame whose pose is by keyframes, or by the whole drive
@@ -89,8 +86,6 @@ class LivePoses:
         self._T_world_camera, self._unit = list(T_world_camera), float(scale.per_frame[-1])
         self.unit_name = scale.unit_name
         self._settled = max(len(T_world_camera) - 1, 0)
-        if len(T_world_camera) > 1:
-            self._T_previous_newest = invert(T_world_camera[-2]) @ T_world_camera[-1]
 
     def _state(self, is_bridged: bool) -> State:
         before, self._was_bridged = self._was_bridged, is_bridged
@@ -104,16 +99,17 @@ class LivePoses:
             self._T_world_camera.append(np.eye(4))
             return False
         before, by_keyframes, motion = index - 1, observer.keyframes.step(index), observer.drive.last_step(index)
-        T_before_frame = self._T_previous_newest
+        T_before_frame = None
         if by_keyframes is not None:
             before, T_before_frame = by_keyframes
             self._settled = index
         elif motion is not None and motion.ends[0] == before:
             T_before_frame = motion.relative_pose.T_from_to.copy()
-        if T_before_frame is not self._T_previous_newest:
+        if T_before_frame is not None:
             T_before_frame[:3, 3] *= self.unit
+        else:  # the camera goes on as it went
+            T_before_frame = invert(self._T_world_camera[max(before - 1, 0)]) @ self._T_world_camera[before]
         self._T_world_camera.append(compose(self._T_world_camera[before], T_before_frame))
-        self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
         return by_keyframes is not None
 
     def _solve(self, observer: Observer, count: int) -> None:
@@ -130,14 +126,13 @@ class LivePoses:
         self.unit_name = scale.unit_name
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
         if self._unit is None:
-            for T in (*self._T_world_camera, self._T_previous_newest):
+            for T in self._T_world_camera:
                 T[:3, 3] *= unit
         self._unit = unit
         if by_keyframes:
             return
-        T_odometry = chain_odometry(make_factors(window, scale, logging.DEBUG), len(window))
+        T_odometry = chain_odometry(make_factors(window, scale, level=logging.DEBUG), len(window))
         kept = max(first, self._settled)
         T_window_camera = T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])
         self._T_world_camera[kept + 1 :] = list(T_world_window @ T_window_camera[1:])
-        self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
+from slam.frames import Intrinsics, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
 from slam.frontend.keyframes.joining import join
 from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.scale.metric_scale import Scale
-from slam.geometry.se3 import FloatArray, apply, invert, make, path_distance
-from slam.graph.similarity_graph import optimise_similarities
+from slam.geometry.se3 import FloatArray, invert, make, path_distance
+from slam.graph.similarity_graph import RelativeSimilarity, optimise_similarities
 from slam.loops.closure import LoopClosures, find_loops, most_inliers_first
 from slam.loops.consistency import Track
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
@@ -78,15 +78,6 @@ def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Int
     return MapClosure(poses, closures, joins)
 
 
-def views_of(keyframes: Sequence[TrackedKeyframe], points: FloatArray) -> list[View]:
-    """Corners of keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
-    views = []
-    for keyframe in keyframes:
-        points_camera = apply(keyframe.T_camera_world, points[keyframe.track_ids]).astype(np.float32)
-        views.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, points_camera))
-    return views
-
-
 class _Rows:
     """The keyframes of all maps, row by row."""
 
@@ -95,7 +86,7 @@ class _Rows:
         self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
         counts = [len(segment.map.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
-        self.T_map_camera = invert(np.array([k.T_camera_world for k in self.keyframes]).reshape(-1, 4, 4))
+        self.T_map_camera = np.concatenate([segment.map.T_world_camera for segment in maps])
         self.track = self._track(poses)
 
     def _track(self, poses: KeyframePoses) -> Track:
@@ -123,7 +114,7 @@ class _Rows:
         views = []
         for segment in self.segments:
             settled = segment.map.parallax(segment.map.keyframes).settled[:, None]
-            views += views_of(segment.map.keyframes, np.where(settled, segment.map.points, np.nan))
+            views += segment.map.views(np.where(settled, segment.map.points, np.nan))
         return views
 
     def apart(self) -> NDArray[np.bool_]:

@@ -6,7 +6,6 @@ import logging
 import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -19,15 +18,13 @@ from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, Snip
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
-from slam.frontend.scale.road_plane import GroundPlaneFitter
+from slam.frontend.scale.road_plane import GroundPlaneFitter, height_of
 from slam.frontend.tracking import ROTATION_BASELINE
-from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
-from slam.pipeline.keyframe_tracking import KeyframeTracking, height_of
+from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch, return_freed_memory
@@ -37,19 +34,6 @@ logger = logging.getLogger(__name__)
 _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
 _LAST_ROADS = 8  # looked back for the camera's height, frames
-
-
-@dataclass(frozen=True)
-class Observations:
-    """All measurements up to a frame, which stay while others follow.
-
-    ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as the steps have them.
-    """
-
-    drive: Drive
-    gate: ImageGate
-    depth_error: DepthError
-    focal_length: FocalLength
 
 
 @dataclass
@@ -99,7 +83,7 @@ class Observer:
         """Prepare for the first frame; ``seed`` is that of all RANSAC draws, ``camera_height_m`` None where unknown."""
         self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
         self.drive = Drive()  # the measurements so far
-        self._gate = ImageGate()
+        self.gate = ImageGate()
         self._odometry = VisualOdometry(intrinsics, seed)
         self.keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
@@ -148,7 +132,7 @@ class Observer:
             return
         self._unread = 0
         with self._stopwatch.stage("read"):
-            verdict: Verdict = self._gate.check(frame) if self._config.gaps.enabled else "new"
+            verdict: Verdict = self.gate.check(frame) if self._config.gaps.enabled else "new"
         if isinstance(verdict, Failed):
             self._leave_out(index, verdict.reason)
             return
@@ -159,7 +143,7 @@ class Observer:
             self._pending = asked
             if verdict == "repeated":  # what is measured of the frame before does not know it
                 self.drive.repeated.append(index)
-                if self._gate.was_moving:
+                if self.gate.was_moving:
                     self.drive.moving.append(index)
 
     def flush(self) -> None:
@@ -168,13 +152,14 @@ class Observer:
         while self._tasks:
             self._measure(len(self.drive) - 1, self._finish_tasks)
 
-    def observations(self) -> Observations:
-        """All measurements so far; more frames may follow."""
+    def measured(self) -> Drive:
+        """All measurements so far, which stay while more frames follow."""
         self.flush()
-        drive, odometry = self.drive.copy(), self._odometry
+        drive = self.drive.copy()
+        drive.depth_error, drive.focal_length = self._odometry.depth_error, self._odometry.focal_length
         drive.maps = self.keyframes.maps(drive)
         drive.events = list(self.keyframes.events)
-        return Observations(drive, copy(self._gate), odometry.depth_error, odometry.focal_length)
+        return drive
 
     @property
     def frames(self) -> int:
@@ -206,7 +191,7 @@ class Observer:
         wants_depth = not by_keyframes and (step is None or has_moved or index % stride == 0 or after_frozen)
         is_dense = not by_keyframes and (step is None or stride == 1)
         wants_snippet = len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0)
-        asked = FrameInWork(frame, None, None, self._gate.standing)
+        asked = FrameInWork(frame, None, None, self.gate.standing)
         if wants_depth:
             self._depth_index, asked.prediction = index, self._predict(frame)
         if wants_snippet:
@@ -220,7 +205,18 @@ class Observer:
         return frames * step.length_unscaled > _MOVED_ON_HEIGHTS * height
 
     def _predict(self, frame: Frame) -> Future[DepthMap]:
-        return self._networks.submit(predicted_depth, self._predictor, frame)
+        """Depth ``(H, W)`` of a frame, by the networks' thread; ``SlamError`` where a user's predictor errs."""
+
+        def predict() -> DepthMap:
+            depth, wanted = self._predictor.depth(frame), frame.image.shape[:2]
+            shape, kind = np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
+            if shape != wanted or kind != np.float32:
+                raise SlamError(
+                    f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}"
+                )
+            return depth
+
+        return self._networks.submit(predict)
 
     def _ask_depth(self, keyframe: Frame) -> None:
         """Predict the depth of a keyframe while it is adjusted, unless it was asked for before."""
@@ -372,16 +368,3 @@ class Observer:
                 result = task.result.result()
             if result is not None:
                 task.keep(result)
-
-
-def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:
-    """Depth ``(H, W)`` of a frame.
-
-    Raises:
-        SlamError: a user's predictor gives something else.
-    """
-    depth = predictor.depth(frame)
-    wanted, shape, kind = frame.image.shape[:2], np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
-    if shape != wanted or kind != np.float32:
-        raise SlamError(f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}")
-    return depth

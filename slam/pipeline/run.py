@@ -12,6 +12,7 @@ from threading import Event
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import calling_on_signals
 from erfsfm.common.threads import read_ahead
+from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
@@ -20,14 +21,17 @@ from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
 from slam.frontend.drive import Drive
-from slam.frontend.factors import chain_odometry, make_factors, with_lidar
+from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import complete_drive
+from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
 from slam.frontend.network_factors import chain_raw
-from slam.frontend.scale.metric_scale import Scale, find_scale, height_by_lidar
-from slam.frontend.scale.scale_estimate import (
+from slam.frontend.scale.metric_scale import (
+    Scale,
     ScaleEstimate,
+    find_scale,
+    height_by_lidar,
     resolve_mode,
     scale_from_distance,
     scale_from_reference,
@@ -37,15 +41,13 @@ from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
-from slam.mapping.depth_refinement import decision
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.pipeline.checks import require_possible, warn_of_doubts
+from slam.pipeline.checks import require_possible, warn_of_doubts, warn_of_images
 from slam.pipeline.estimate import Estimate, Odometry
 from slam.pipeline.fusion import fuse
-from slam.pipeline.map_closure import MapClosure, close_maps
-from slam.pipeline.observer import Observations, Observer
-from slam.pipeline.positioning import Location, Positioning
+from slam.pipeline.map_closure import close_maps
+from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.timing import Stopwatch
@@ -89,7 +91,7 @@ class SlamPipeline:
         self.sequence, self._predictor, self._config = sequence, predictor, config
         self._progress, self._seed, self._gps_track = progress, seed, gps_track
         self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
-        self._positioning: Positioning | None = None  # the GPS track matched to the drive
+        self._fixes: GpsFixes | None = None  # those of the GPS track during the drive
         self._watch = Stopwatch()
         self._interrupted = Event()
 
@@ -118,7 +120,7 @@ class SlamPipeline:
         self._leave_out_unseen(observed)
         self._progress("loops and graph", 0, 1)
         estimate = self.solve(observed, recorder)
-        warn_of_doubts(estimate.drive, observed.gate)
+        warn_of_doubts(estimate.drive)
         self._progress("loops and graph", 1, 1)
         recorder.estimate(estimate)
         mapped = attempt("the map", lambda: self._mapped(estimate, recorder))
@@ -127,7 +129,7 @@ class SlamPipeline:
             return estimate
         return mapped
 
-    def solve(self, observed: Observations, recorder: Recorder) -> Estimate:
+    def solve(self, observed: Drive, recorder: Recorder) -> Estimate:
         """Lengths, factors and loops of a drive, and the trajectory that fits them.
 
         An error in the search for loops costs the loops, one in the graph the loops and the graph: the optimised
@@ -141,13 +143,13 @@ class SlamPipeline:
         if reference is not None:
             recorder.trajectory("reference", reference)
         with self._watch.stage("geometry"):
-            poses = keyframe_poses(observed.drive.maps, self.sequence.intrinsics, self._seed)
-        drive = self._completed(observed, MapClosure(poses))
+            poses = keyframe_poses(observed.maps, self.sequence.intrinsics, self._seed)
+        drive = complete_drive(observed, self._predictor.sources, poses)
         network = self._trajectory(chain_raw(drive.snippets, len(drive)))
         recorder.trajectory("network", network)
         with self._watch.stage("lidar"):
             lidar = lidar_path(self.sequence, self._progress)
-        lidar_steps, agreements = self._compared(drive, lidar, observed)
+        lidar_steps, agreements = self._compared(drive, lidar)
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self.sequence.camera_height_m, drive, lidar_steps)
         odometry = self._odometry(drive, scale, lidar_steps, agreements)
@@ -155,13 +157,13 @@ class SlamPipeline:
         with self._watch.stage("loops"):
             closed = attempt("loop closure", lambda: self._closed(odometry, observed))
         odometry, loops = (odometry, LoopClosures(not_sought=closed.reason)) if isinstance(closed, Failed) else closed
-        gps = self._positioning
-        location = None if gps is None else gps.locate(odometry.T_world_camera, odometry.scale.estimate)
+        fixes = self._fixes
+        location = None if fixes is None else fixes.locate(odometry.T_world_camera, odometry.scale.estimate)
         solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
         if isinstance(solved, Failed):
             solved = solved, odometry.T_world_camera, LoopClosures(not_sought=solved.reason), location
         graph, T_optimised, loops, location = solved
-        agreements, support, confidence = self._confidence(odometry, observed)
+        agreements, confidence = self._confidence(odometry)
         return Estimate(
             network=network,
             odometry=self._trajectory(odometry.T_world_camera),
@@ -169,7 +171,6 @@ class SlamPipeline:
             lidar=lidar,
             reference=reference,
             drive=odometry.drive,
-            depth_error=observed.depth_error,
             scale=odometry.scale,
             factors=odometry.factors,
             views=odometry.views(),
@@ -179,7 +180,6 @@ class SlamPipeline:
             stopwatch=self._watch,
             agreements=agreements,
             confidence=confidence,
-            support=support,
         )
 
     def fuse(self, estimate: Estimate, recorder: Recorder) -> TsdfMap | None:
@@ -195,14 +195,14 @@ class SlamPipeline:
         return Observer(self._predictor, self.sequence.intrinsics, *parts)
 
     def require_possible(self) -> None:
-        """Check that this run can succeed, and match its GPS track; as `checks.require_possible` and `Positioning`."""
+        """Check that this run can succeed, and match its GPS track; as `checks.require_possible` and `GpsFixes`."""
         shortest = self._predictor.sources + 1
         require_possible(self.sequence, self._config, shortest, self._gps_track is not None)
         if self._gps_track is not None:
-            self._positioning = Positioning(self._gps_track, self.sequence.stamps, self._config.gps, self.mode)
+            self._fixes = GpsFixes(self._gps_track, self.sequence.stamps, self._config.gps, self.mode)
         _ = self._decide
 
-    def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Observations:
+    def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Drive:
         """One pass over the frames, to its end or until it is interrupted."""
         total = len(self.sequence)
         ahead = read_ahead(partial(read_frame, self.sequence), range(total))
@@ -213,11 +213,13 @@ class SlamPipeline:
                 self._progress("frames", index + 1, total)
                 if self._interrupted.is_set():
                     break
-            return observer.observations()
+            measured = observer.measured()
+            warn_of_images(observer.gate)
+            return measured
 
-    def _leave_out_unseen(self, observed: Observations) -> None:
+    def _leave_out_unseen(self, observed: Drive) -> None:
         """After an interrupted pass the sequence is what was seen."""
-        seen, total = len(observed.drive), len(self.sequence)
+        seen, total = len(observed), len(self.sequence)
         if seen == total:
             return
         if seen <= self._predictor.sources:
@@ -226,10 +228,6 @@ class SlamPipeline:
         assert isinstance(self.sequence, RecordedSequence)  # a live drive is what was seen
         self.sequence = self.sequence.cut(0, seen)
         self.require_possible()
-
-    def _completed(self, observed: Observations, closure: MapClosure) -> Drive:
-        """The drive with its gaps interpolated and the poses of its maps."""
-        return complete_drive(observed.drive, self._predictor.sources, closure.poses, closure.joins)
 
     def _odometry(
         self, drive: Drive, scale: Scale, lidar_steps: Sequence[RelativePose], agreements: Sequence[Agreement]
@@ -241,9 +239,8 @@ class SlamPipeline:
                 name, height, spread = f"scale.mode={self.mode}", self.sequence.camera_height_m, scale.estimate.spread
                 agreements = [*agreements, agreement.of_height(name, unit.value, height, spread).required()]
             scale = scale.in_metres(unit)
-        factors = make_factors(drive, scale)
-        if self._config.lidar.factors and scale.is_metric:
-            factors = with_lidar(factors, lidar_steps)
+        as_factors = lidar_steps if self._config.lidar.factors and scale.is_metric else ()
+        factors = make_factors(drive, scale, as_factors)
         return Odometry(drive, scale, factors, chain_odometry(factors, len(drive)), lidar_steps, agreements)
 
     def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | Failed:
@@ -251,19 +248,19 @@ class SlamPipeline:
         sequence = self.sequence
         if self.mode == "reference" and sequence.reference is not None:
             return scale_from_reference(T_odometry, sequence.reference)
-        if self.mode == "gps" and self._positioning is not None:
-            return self._positioning.scale(T_odometry)
+        if self.mode == "gps" and self._fixes is not None:
+            return self._fixes.scale(T_odometry)
         return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
 
-    def _closed(self, odometry: Odometry, observed: Observations) -> tuple[Odometry, LoopClosures]:
+    def _closed(self, odometry: Odometry, observed: Drive) -> tuple[Odometry, LoopClosures]:
         """The loops of a drive, and its odometry, which that of closed maps replaces."""
         camera, config, seed = self.sequence.intrinsics, self._config.loops, self._seed
-        if not (observed.drive.maps and config.enabled):
+        if not (observed.maps and config.enabled):
             views, is_metric = odometry.views(), odometry.scale.is_metric
             return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
-        closure = close_maps(observed.drive.maps, odometry.drive.map_poses, camera, seed)
+        closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
         if closure.loops.accepted:
-            drive = self._completed(observed, closure)
+            drive = complete_drive(observed, self._predictor.sources, closure.poses, closure.joins)
             odometry = self._odometry(drive, odometry.scale, odometry.lidar_steps, odometry.agreements)
         return odometry, closure.closures(odometry.scale)
 
@@ -271,17 +268,19 @@ class SlamPipeline:
         self, odometry: Odometry, loops: LoopClosures, location: Location | Failed | None
     ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | Failed | None]:
         """The graph, its trajectory ``(N, 4, 4)``, the loops that agree with it, and where it lies on the earth."""
-        graph, positioning = PoseGraph(), self._positioning
-        T_odometry = odometry.T_world_camera
+        graph, T_odometry, in_graph = PoseGraph(), odometry.T_world_camera, self._config.gps.factors
         graph.add_relative(*odometry.factors, *(loop.measured for loop in loops.accepted))
-        if positioning is not None and isinstance(location, Location):
-            positioning.add_factors(graph, location, T_odometry)
+        if isinstance(location, Location) and in_graph:
+            positions = location.fixes.at_frames(location.T_enu_world, T_odometry)
+            graph.add_positions(*positions, location.T_enu_world)
         with self._watch.stage("graph"):
             T_optimised = graph.optimise(T_odometry)
             while graph.drop_contradicted_loops():
                 T_optimised = graph.optimise(T_odometry)
-        if positioning is not None and isinstance(location, Location):
-            location = positioning.relocated(graph, T_optimised, odometry.scale.estimate)
+        if isinstance(location, Location) and in_graph:
+            location = replace(location, T_enu_world=graph.T_fixed_world)
+        elif isinstance(location, Location):
+            location = location.fixes.locate(T_optimised, odometry.scale.estimate)
         return graph, T_optimised, loops.without(graph.dropped), location
 
     def _mapped(self, estimate: Estimate, recorder: Recorder) -> Estimate:
@@ -290,7 +289,7 @@ class SlamPipeline:
         return mapped
 
     def _compared(
-        self, drive: Drive, lidar: LidarPath | Failed | None, observed: Observations
+        self, drive: Drive, lidar: LidarPath | Failed | None
     ) -> tuple[Sequence[RelativePose], list[Agreement]]:
         """Steps by LiDAR unless the images contradict them, and LiDAR and depth from elsewhere beside the images.
 
@@ -303,35 +302,29 @@ class SlamPipeline:
             by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self.sequence.camera_height_m, 0.0))
         worst = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
         compared = [] if worst is None else [worst.required() if self.mode == "lidar" else worst.said()]
-        source, error = self._config.depth.source, observed.depth_error
-        if source != "network" and (by_depth := agreement.of_depth(source, error)) is not None:
+        source = self._config.depth.source
+        if source != "network" and (by_depth := agreement.of_depth(source, drive.depth_error)) is not None:
             compared.append(by_depth.required())
         return [] if worst is not None and worst.is_wrong else steps, compared
 
-    def _confidence(
-        self, odometry: Odometry, observed: Observations
-    ) -> tuple[list[Agreement], FloatArray | None, float | Failed]:
-        """Agreements of all sources and of the images, the support of each frame, and what follows from both."""
+    def _confidence(self, odometry: Odometry) -> tuple[list[Agreement], float | Failed]:
+        """Agreements of all sources and of the images, and what follows from them."""
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
-        if self._positioning is not None and self._positioning.agreement is not None:
-            by_gps = self._positioning.agreement
+        if self._fixes is not None and (by_gps := self._fixes.agreement) is not None:
             by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
-        support = None if drive.maps else agreement.frame_support(range(len(drive)), drive.motions)
         needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
-        camera = self.sequence.intrinsics
-        of_images = agreement.of_images(
-            drive, observed.depth_error, observed.focal_length, camera, support, scale.contradicted, needs_road
-        )
+        of_images = agreement.of_images(drive, self.sequence.intrinsics, scale.contradicted, needs_road)
         if not drive.maps:
             of_images.append(agreement.of_directions(odometry.T_world_camera))
         trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]
         sure = agreement.confidence(trusted, scale.is_metric, bool(drive.maps))
-        return [*by_sources, *of_images], support, sure
+        return [*by_sources, *of_images], sure
 
     @cached_property
     def _decide(self) -> Decide | None:
-        """Between learned and measured depth of the map's keyframes."""
-        return decision(self._config.depth) if self._config.mapping.enabled else None
+        """What decides between learned and measured depth of the map's keyframes; None where it is not refined."""
+        is_refined = self._config.mapping.enabled and self._config.depth.refine == "learned"
+        return DepthFusion(self._config.depth.fusion).decide if is_refined else None
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self.sequence.stamps, T_world_camera)

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.inference import DepthPosePredictor, depth_at, limit_torch_threads
 from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
-from slam.frames import DepthMap, Frame, Image, Intrinsics, Predictor, SnippetPoses
+from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers, Undistort
 from slam.prediction.depth_source import DepthSource, SourcedPredictor
 from slam.prediction.onnx_depth import OnnxDepth
@@ -21,33 +21,11 @@ from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_plug_in, plug_ins
 
 
-class Networks(Protocol):
-    """Interface of the networks (``erfsfm.inference.DepthPosePredictor``); each image is prepared once."""
-
-    sources: int
-
-    def prepare(self, image: Image) -> Any:
-        """An image as input of the networks."""
-
-    def disparity(self, image: Any) -> NDArray[np.float32]:
-        """Unscaled 1/depth ``(h, w)`` of a prepared image, at the networks' own size."""
-
-    def poses(self, images: Sequence[Any]) -> NDArray[np.float64]:
-        """``T_source_target`` ``(N, 4, 4)`` of N + 1 prepared images in time order, the target in the middle."""
-
-
 class NetworkPredictor:
-    """Depth and snippet poses of the frames of one sequence, by the networks."""
+    """Depth and snippet poses of frames by the networks, for which each image is prepared once."""
 
-    def __init__(self, networks: Networks, intrinsics: Intrinsics) -> None:
-        """Predict for the frames of one sequence.
-
-        Args:
-            networks: depth and pose network.
-            intrinsics: of all images.
-        """
+    def __init__(self, networks: DepthPosePredictor) -> None:
         self._networks = networks
-        self._intrinsics = intrinsics
         self._key = object()  # key of outputs kept in frames, which outlive the networks
         self.sources = networks.sources
 
@@ -129,5 +107,5 @@ def open_prediction(
     """
     source = open_depth(depth, intrinsics, numbers, undistort)
     networks = DepthPosePredictor.from_weights(weights, device, "onnx")
-    own = NetworkPredictor(networks, intrinsics)
+    own = NetworkPredictor(networks)
     return Prediction(networks, source, own if source is None else SourcedPredictor(own, source, depth.align))

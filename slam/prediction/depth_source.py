@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
+from slam.geometry.robust import mad_sigma
 from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
@@ -160,7 +161,7 @@ def _affine(own: NDArray[np.float64], wanted: NDArray[np.float64], gain: float) 
     fitted = np.array([gain, 0.0])
     for _ in range(_REWEIGHTINGS):
         residual = columns @ fitted - wanted
-        sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-12)
+        sigma = max(mad_sigma(residual), 1e-12)
         weighted = columns / (1 + (residual / (2 * sigma)) ** 2)[:, None]
         fitted = np.linalg.lstsq(weighted.T @ columns, weighted.T @ wanted, rcond=None)[0]
     if fitted[0] <= 0:

@@ -17,13 +17,12 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence, runs
-from slam.frontend import gps
 from slam.frontend.drive import DOUBLED
+from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import FloatArray, umeyama
 from slam.loops.closure import MOST_REJECTED, LoopClosures
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.positioning import Location
 from slam.results import metrics as records
 from slam.results.metrics import Metrics
 from slam.runtime.errors import Failed
@@ -48,7 +47,7 @@ def estimate_metrics(
         scale=_scale(result),
         agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
         confidence=records.ConfidenceMetrics.of(run=result.confidence),
-        support=_BY_MAPS if result.support is None else result.support.round(2).tolist(),
+        support=_BY_MAPS if (support := result.drive.support) is None else support.round(2).tolist(),
         trajectories=records.Trajectories.of(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),
@@ -175,7 +174,7 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
 
 def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
-    curve, unit = result.depth_error.curve(), float(np.median(result.scale.per_frame))
+    curve, unit = result.drive.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
         return Failed("no step triangulated corners with learned depth")
     return [{"depth": unit * at, "bias": b, "sigma": s, "corners": count} for at, b, s, count in curve]
@@ -190,7 +189,7 @@ def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
     latitude, longitude, height = location.fixes.frame.places(T_enu_first[None, :3, 3])[0].tolist()
     ahead = T_enu_first[:3, 2]
     heading = float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0)
-    aligned = gps.align(location.fixes, result.odometry.T_world_camera, result.odometry.stamps)
+    aligned = location.fixes.align(result.odometry.T_world_camera)
     return records.GpsMetrics.of(
         fixes=len(location.fixes.stamps),
         in_graph=in_graph,
@@ -200,8 +199,8 @@ def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
     )
 
 
-def _distances(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> records.GpsErrors:
-    apart = gps.offsets(fixes, T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
+def _distances(fixes: GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> records.GpsErrors:
+    apart = fixes.offsets(T_enu_world @ trajectory.T_world_camera)
     level = np.linalg.norm(apart[:, :2], axis=1)
     return records.GpsErrors(
         horizontal_rmse_m=float(np.sqrt((level**2).mean())),

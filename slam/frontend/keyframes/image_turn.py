@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.frames import Grey, Intrinsics
-from slam.frontend.image_gate import slopes_of
+from slam.frames import Grey, Intrinsics, slopes_of
 from slam.frontend.tracking import Pixels
 from slam.geometry.epipolar import rotation_between
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, nearest_depth
+from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, View, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, track
 from slam.geometry.resection import PIXEL_SIGMA
@@ -101,8 +101,8 @@ class TrackedKeyframe:
     """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
 
     ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the middle row.
-    ``learned_depth`` ``(M,)`` is NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once the image is
-    not kept any more.
+    ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once
+    the image is not kept any more.
     """
 
     index: int
@@ -145,6 +145,11 @@ class LocalMap:
         """A snapshot, which stays while this map grows."""
         return LocalMap(self.keyframes.copy(), self.points.copy())
 
+    @property
+    def T_world_camera(self) -> FloatArray:
+        """Poses of the keyframes ``(K, 4, 4)``."""
+        return invert(np.array([keyframe.T_camera_world for keyframe in self.keyframes]).reshape(-1, 4, 4))
+
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
         return np.asarray(np.isfinite(self.points[track_ids, 0]))
@@ -160,6 +165,12 @@ class LocalMap:
         self.keyframes.append(keyframe)
         if len(self.keyframes) > _IMAGES_KEPT:
             self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
+
+    def views(self, points: FloatArray) -> list[View]:
+        """Corners of all keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
+        in_cameras = (apply(k.T_camera_world, points[k.track_ids]).astype(np.float32) for k in self.keyframes)
+        pairs = zip(self.keyframes, in_cameras, strict=True)
+        return [View(k.index, k.pixels.astype(np.float32), k.descriptors, own) for k, own in pairs]
 
     def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
         """Of all points, between those of the keyframes that see them."""
@@ -246,7 +257,7 @@ class LocalMap:
 
         track = joined(keyframe.track_ids for keyframe in keyframes)
         pixel = joined(keyframe.pixels for keyframe in keyframes)
-        depth = joined(np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan) for keyframe in keyframes)
+        depth = joined(keyframe.learned_depth for keyframe in keyframes)
         sigma = self.parallax(keyframes).prior_sigma(PIXEL_SIGMA / intrinsics.fx)[track]
         twice = np.bincount(track, minlength=len(self.points))[track] > 1
         points, row_of = np.unique(track[twice], return_inverse=True)
@@ -255,8 +266,7 @@ class LocalMap:
     def ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
         """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""
         depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
-        learned = np.where(keyframe.learned_depth > 0.0, keyframe.learned_depth, np.nan)
-        return np.asarray(depth / learned)
+        return np.asarray(depth / keyframe.learned_depth)
 
     def aligned(self, image: NewImage, track_ids: TrackIds, pixels: Pixels) -> Pixels:
         """Corners of a new keyframe aligned to the earliest of the last keyframes that sees them, against drift."""

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
+from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.keyframes.first_motion import first_motion
 from slam.frontend.keyframes.image_turn import (
     ImageTurn,
@@ -26,7 +26,8 @@ from slam.frontend.keyframes.image_turn import (
     small_image,
     turned,
 )
-from slam.frontend.keyframes.local_map import MapSegment, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import LocalMap, MapSegment, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.relocalisation import Relocaliser
 from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, new_corners, track
 from slam.geometry.epipolar import parallax_px
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
@@ -47,7 +48,7 @@ _LAST_FRAMES = 4  # frames in which a pose is looked up
 _PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
 _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
-MAX_CORNERS = 500  # of a keyframe
+_MAX_CORNERS = 500  # of a keyframe
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -62,10 +63,12 @@ class KeyframeOdometry:
         intrinsics: Intrinsics,
         seed: int = 0,
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
+        relocalises: bool = False,
     ) -> None:
         """Prepare for the first frame; ``seed`` is that of RANSAC.
 
-        ``on_keyframe`` is told of a keyframe before it is adjusted, so that its depth is predicted meanwhile.
+        ``on_keyframe`` is told of a keyframe before it is adjusted, so that its depth is predicted meanwhile. Where it
+        ``relocalises``, a lost camera is looked for among all keyframes of its map.
         """
         self._intrinsics = intrinsics
         self._seed = seed
@@ -79,26 +82,39 @@ class KeyframeOdometry:
         self._small: SmallImage = np.zeros((0, 0), np.float32)
         self.events: list[TrackingEvent] = []
         self._spread: FloatArray | None = None  # of the points of the last keyframe, once they are looked for
+        self._relocalises = relocalises
+        self._relocaliser: Relocaliser | None = None  # of the lost map
 
-    def lost_map(self) -> MapSegment | None:
+    def follow(self, frame: Frame) -> None:
+        """Track and resect the next usable frame; make it a keyframe where that is wanted.
+
+        Where too few corners are tracked, the turn of the whole image leads to a keyframe of new corners. Depth of the
+        last keyframe has been learned, if it has any.
+        """
+        self._follow(frame)
+        lost = self._lost_map() if self._relocalises else None
+        if lost is None:
+            self._relocaliser = None
+        else:
+            self._relocalise(lost, frame)
+
+    def _lost_map(self) -> LocalMap | None:
         """The map in which the camera was lost, until it is found again or another map has points."""
-        started = [segment for segment in self.segments if segment.started]
+        started = [segment.map for segment in self.segments if segment.started]
         is_lost = bool(started) and (self._lost > 0 or not self.segments[-1].started)
         return started[-1] if is_lost else None
 
-    def relocalise(
-        self,
-        frame: Frame,
-        T_camera_world: FloatArray,
-        track_ids: TrackIds,
-        pixels: Pixels,
-        place: int,
-    ) -> None:
-        """Go on in the lost map with the frame that was added last, which becomes a keyframe.
-
-        It sees points of the map, each once, by ``track_ids`` ``(M,)`` at ``pixels`` ``(M, 2)``; ``place`` is the frame
-        of the keyframe with most of these.
-        """
+    def _relocalise(self, lost: LocalMap, frame: Frame) -> None:
+        """Look for the camera in the lost map; where it is found, the map goes on with this frame as a keyframe."""
+        if self._relocaliser is None or self._relocaliser.local is not lost:  # one that begins may be lost at once
+            self._relocaliser = Relocaliser(lost, self._intrinsics, self._seed)
+        corners = new_corners(frame.grey, _NOTHING[1], _MAX_CORNERS)
+        unknown = np.full((len(corners), 3), np.nan, np.float32)
+        found = self._relocaliser.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
+        if found is None:
+            return
+        self._relocaliser = None  # the new keyframe changes the map
+        T_camera_world, track_ids, pixels, place = found
         if self.segments[-1].started:
             self._note(self.segments[-1].frames[-self._lost].index, "lost")
             self.segments[-1].frames.pop()
@@ -111,12 +127,7 @@ class KeyframeOdometry:
         pixels = in_middle_row(pixels, self._turn_rate, self._intrinsics)
         segment.frames.append(self._tracked(frame, track_ids, pixels))
 
-    def follow(self, frame: Frame) -> None:
-        """Track and resect the next usable frame; make it a keyframe where that is wanted.
-
-        Where too few corners are tracked, the turn of the whole image leads to a keyframe of new corners. Depth of the
-        last keyframe has been learned, if it has any.
-        """
+    def _follow(self, frame: Frame) -> None:
         before, self._small = self._small, small_image(frame.grey)
         shift = image_shift(before, self._small)
         images = before, self._small, self._T_last_step[:3, :3], shift, self._intrinsics
@@ -264,7 +275,7 @@ class KeyframeOdometry:
             pixels = local.aligned(image, track_ids, pixels)
             again, reprojected = local.found_again(image, track_ids)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
-        fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels))
+        fresh = new_corners(frame.grey, pixels, _MAX_CORNERS - len(pixels))
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)

@@ -75,9 +75,8 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
 
 def _held(segment: MapSegment, carried: FloatArray) -> MapSegment:
     """The map in the unit of learned depth, which holds its unit in the long run, and learned depth in the map's."""
-    keyframes = segment.map.keyframes
     units, corrections = learned_units(segment.map, carried)
-    T = invert(np.array([keyframe.T_camera_world for keyframe in keyframes]))
+    T = segment.map.T_world_camera
     steps = invert(T[:-1]) @ T[1:]
     steps[:, :3, 3] *= np.sqrt(units[:-1] * units[1:])[:, None]
     held = moved(segment, chain(steps), units)

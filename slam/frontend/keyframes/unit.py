@@ -12,7 +12,7 @@ from scipy.linalg import solveh_banded
 
 from slam.frontend.keyframes.local_map import LocalMap
 from slam.geometry.robust import mad_sigma
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray
 
 _LEAST_DEPTHS = 20
 _SHARED = 10  # keyframes that share an error of learned depth
@@ -84,7 +84,7 @@ def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], see
 
 def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
     """The median height of the keyframes above the plane below which nothing is; None where no such plane is seen."""
-    T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in local.keyframes]))
+    T_map_camera = local.T_world_camera
     centres, down = T_map_camera[:, :3, 3], T_map_camera[:, :3, 1].mean(axis=0)
     seen = np.unique(np.concatenate([keyframe.track_ids for keyframe in local.keyframes]))
     points = local.points[seen[local.parallax(local.keyframes).settled[seen]]]

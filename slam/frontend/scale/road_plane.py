@@ -37,6 +37,11 @@ class GroundPlane:
     inlier_ratio: float
 
 
+def height_of(road: GroundPlane | Failed) -> float | None:
+    """The camera's height over the ground plane of a frame, unscaled; None without one."""
+    return road.height_unscaled if isinstance(road, GroundPlane) else None
+
+
 class GroundPlaneFitter:
     """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
 

@@ -129,36 +129,39 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
     learned_sigma = _LEARNED_SIGMA * np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
     zero = np.full(steps, 2 * steps)  # behind the last state
+    # state[plus] - state[minus] = value, with a sigma: plus, minus, value, sigma
     parts = [
-        _Equations(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
-        _Equations(lengths, zero, evidence.absolute, evidence.absolute_sigma),
-        _Equations(lengths, units, evidence.learned, learned_sigma),
-        _Equations(lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
-        _Equations(units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
+        (lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
+        (lengths, zero, evidence.absolute, evidence.absolute_sigma),
+        (lengths, units, evidence.learned, learned_sigma),
+        (lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
+        (units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
         # one prior on the unit of the whole drive, divided among its steps
-        _Equations(units, zero, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
+        (units, zero, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
     ]
     measured = np.zeros(2 * steps, dtype=bool)
-    for part in parts[:3]:
-        measured[part.plus[np.isfinite(part.value)]] = True
+    for state_of, _, value, _ in parts[:3]:
+        measured[state_of[np.isfinite(value)]] = True
     idle = np.where(measured | (np.arange(2 * steps) % 2 == 1), 0.0, 1.0)
-    equations = _Equations.known_of(parts)
-    state, weights = np.zeros(2 * steps), np.ones(len(equations.value))
+    plus, minus, value, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
+    known = np.isfinite(value) & np.isfinite(sigma)
+    plus, minus, value, sigma = plus[known], minus[known], value[known], sigma[known]
+    state, weights = np.zeros(2 * steps + 1), np.ones(len(value))
     for iteration in range(_ITERATIONS):
-        information, right = equations.normal(weights, idle)
-        state = solveh_banded(information, right)
-        residual = np.abs(equations.residual(state))
+        information, right = _normal_equations(plus, minus, value, weights / sigma**2, idle)
+        state[:-1] = solveh_banded(information, right)
+        residual = np.abs((state[plus] - state[minus] - value) / sigma)
         robust = 1.0 / (1.0 + (residual / OUTLIER_SIGMAS) ** 2)
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
     log_length, log_unit = state[lengths], state[units]
-    known = np.where(measured[lengths], 1.0, np.nan)
+    of_measured = np.where(measured[lengths], 1.0, np.nan)
     sigmas, correlations = marginals(information)
     correlated_sigmas = _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
-    sigmas, correlated_sigmas = known * sigmas, known * correlated_sigmas
+    sigmas, correlated_sigmas = of_measured * sigmas, of_measured * correlated_sigmas
     by_learned = (evidence.learned + log_unit - log_length) / _LEARNED_SIGMA
     by_speed = (np.diff(log_length, prepend=np.nan) - evidence.steady) / (evidence.steady_sigma + _LENGTH_SIGMA)
     contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (np.abs(by_speed) > _CONTRADICTION_SIGMAS)
-    return StepLengths(known * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted)
+    return StepLengths(of_measured * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted)
 
 
 def marginals(information: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -199,39 +202,20 @@ def _from_before(own: FloatArray, coupling: FloatArray) -> FloatArray:
     return np.array(chain)
 
 
-@dataclass(frozen=True)
-class _Equations:
-    """``state[plus] - state[minus] = value``, M of them with a ``sigma`` each; the place behind the last state is zero.
+def _normal_equations(
+    plus: NDArray[np.intp], minus: NDArray[np.intp], value: FloatArray, weights: FloatArray, idle: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side.
 
-    No equation ties states that are more than two places apart, so that the normal equations are banded.
+    Of equations ``state[plus] - state[minus] = value``, ``(M,)`` each; the place behind the last state is zero. None
+    ties states that are more than two places apart.
     """
 
-    plus: NDArray[np.intp]
-    minus: NDArray[np.intp]
-    value: FloatArray
-    sigma: FloatArray
+    def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(places, values, len(idle) + 1)[: len(idle)], np.float64)
 
-    @classmethod
-    def known_of(cls, parts: Sequence[_Equations]) -> _Equations:
-        """All equations without NaN."""
-        known = [np.isfinite(part.value) & np.isfinite(part.sigma) for part in parts]
-        columns = zip(*((p.plus[k], p.minus[k], p.value[k], p.sigma[k]) for p, k in zip(parts, known)), strict=True)
-        return cls(*map(np.concatenate, columns))
-
-    def residual(self, state: FloatArray) -> FloatArray:
-        """``(M,)`` in sigmas."""
-        with_zero = np.append(state, 0.0)
-        return np.asarray((with_zero[self.plus] - with_zero[self.minus] - self.value) / self.sigma)
-
-    def normal(self, weights: FloatArray, idle: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side."""
-        weights = weights / self.sigma**2
-
-        def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
-            return np.asarray(np.bincount(places, values, len(idle) + 1)[: len(idle)], np.float64)
-
-        later, apart = np.maximum(self.plus, self.minus), np.abs(self.plus - self.minus)
-        off_diagonal = (-added(later, np.where(apart == distance, weights, 0.0)) for distance in (2, 1))
-        diagonal = idle + added(self.plus, weights) + added(self.minus, weights)
-        right = added(self.plus, weights * self.value) - added(self.minus, weights * self.value)
-        return np.array([*off_diagonal, diagonal]), right
+    later, apart = np.maximum(plus, minus), np.abs(plus - minus)
+    off_diagonal = (-added(later, np.where(apart == distance, weights, 0.0)) for distance in (2, 1))
+    diagonal = idle + added(plus, weights) + added(minus, weights)
+    right = added(plus, weights * value) - added(minus, weights * value)
+    return np.array([*off_diagonal, diagonal]), right

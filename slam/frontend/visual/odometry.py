@@ -38,10 +38,10 @@ from slam.frontend.visual.two_view import (
     INLIER_PX,
     Matches,
     TwoViewEstimate,
-    TwoViewEstimator,
+    estimate,
+    refined,
 )
 from slam.geometry.epipolar import (
-    UnitRelativePose,
     depth_in_current,
     parallax_px,
     rotation_between,
@@ -93,7 +93,6 @@ class VisualOdometry:
         self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
         self._tracker = CornerTracker()
-        self._two_views = TwoViewEstimator(intrinsics.fx, seed)
         self.depth_error, self.focal_length = DepthError(), FocalLength()
         self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
@@ -144,10 +143,9 @@ class VisualOdometry:
 
         None where nothing moved.
         """
-        known = UnitRelativePose.of(motion.relative_pose.T_from_to)
-        if known is None:
-            return None
-        return PredictedFlow(*known, self._reduced_depth(depth_previous_unscaled), self._intrinsics).depth_current()
+        depth = self._reduced_depth(depth_previous_unscaled)
+        flow = PredictedFlow.of(motion.relative_pose.T_from_to, depth, self._intrinsics)
+        return None if flow is None else flow.depth_current()
 
     def relative_rotation(
         self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
@@ -157,12 +155,12 @@ class VisualOdometry:
         Returns:
             A function that measures it from the present state, in any thread; its result is None with too few corners.
         """
-        known = UnitRelativePose.of(T_first_last)
-        if known is None:
-            return lambda: None
         first, last = self._reduced(first), self._reduced(last)
         depth_first_unscaled = self._reduced_depth(depth_first_unscaled)
-        find = self._tracker.track_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
+        flow = PredictedFlow.of(T_first_last, depth_first_unscaled, self._intrinsics)
+        if flow is None:
+            return lambda: None
+        find = self._tracker.track_across(first, last, flow)
         mask, error = self._dynamic_mask, self.depth_error
 
         def measure() -> RelativeRotation | None:
@@ -171,11 +169,11 @@ class VisualOdometry:
                 return None
             votes, learned = np.ones(len(tracks), dtype=bool), nearest_depth(depth_first_unscaled, tracks.previous)
             matches = self._matches(tracks, votes, learned, None, mask, error)
-            estimate = self._two_views.refined(matches, known[0])
-            if estimate is None or estimate.inliers.sum() < MIN_INLIERS:
+            two_view = refined(matches, flow.unit_pose)
+            if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
-            sigmas = np.sqrt(np.diag(estimate.covariance)[:3])
-            return RelativeRotation(first.index, last.index, estimate.unit_pose.R_current_previous, sigmas)
+            sigmas = np.sqrt(np.diag(two_view.covariance)[:3])
+            return RelativeRotation(first.index, last.index, two_view.unit_pose.R_current_previous, sigmas)
 
         return measure
 
@@ -186,8 +184,7 @@ class VisualOdometry:
             return None
         if last.ends[1] - last.ends[0] != current.index - previous.index:
             return None
-        known = UnitRelativePose.of(last.relative_pose.T_from_to)
-        return None if known is None else PredictedFlow(*known, depth_previous, self._intrinsics)
+        return PredictedFlow.of(last.relative_pose.T_from_to, depth_previous, self._intrinsics)
 
     def _votes(self, tracks: Tracks) -> NDArray[np.bool_]:
         """Which tracks ``(M,)`` have the vote: all, where few are left that fitted the last motion."""
@@ -208,7 +205,8 @@ class VisualOdometry:
         on_road = np.zeros(len(tracks), dtype=bool)
         if height is not None:
             on_road = np.abs(rays_previous[:, 1] * depth / height - 1.0) < _ROAD_TOLERANCE
-        return Matches(rays_previous, rays_current, depth, sigma, on_road, mask.weights(tracks.previous), votes)
+        weights, focal_px = mask.weights(tracks.previous), self._intrinsics.fx
+        return Matches(rays_previous, rays_current, depth, sigma, on_road, weights, votes, focal_px)
 
     def _still(self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray) -> Motion | None:
         flows = np.linalg.norm(tracks.current - tracks.previous, axis=1)
@@ -242,7 +240,7 @@ class VisualOdometry:
         ends, seconds = (frames[0].index, frames[1].index), frames[1].stamp - frames[0].stamp
 
         def step(corners: Matches, before: MotionHistory) -> Step | None:
-            two_view = self._two_views.estimate(corners, before)
+            two_view = estimate(corners, before, self._seed)
             if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
             return self._triangulated(ends, seconds, tracks, corners, trusted_depth(learned, height), two_view)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Self
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics
 from slam.geometry.epipolar import UnitRelativePose
+from slam.geometry.se3 import FloatArray
 
 _NEAREST = 1e-6
 _INVERSIONS = 2
@@ -35,6 +37,12 @@ class PredictedFlow:
     length: float
     depth_previous: DepthMap
     intrinsics: Intrinsics
+
+    @classmethod
+    def of(cls, T_previous_current: FloatArray, depth_previous: DepthMap, intrinsics: Intrinsics) -> Self | None:
+        """By a pose in the unit of the depth; None where it has no length."""
+        known = UnitRelativePose.of(T_previous_current)
+        return None if known is None else cls(*known, depth_previous, intrinsics)
 
     def warp_back(self, current: Grey) -> Grey:
         """The later image ``(H, W)`` warped to the earlier one, equal to it where the prediction is right."""

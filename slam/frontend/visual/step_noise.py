@@ -12,7 +12,9 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.geometry.robust import mad_sigmas
+from slam.frames import Ends
+from slam.frontend.visual.motion import Motion, links
+from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert
 
 # sigmas over the jitter and over the residual, by Student's t on KITTI 00 and five simulated drives; ratios of other
@@ -27,67 +29,65 @@ _THIRD_DIFFERENCE = np.sqrt(20.0)
 _NEIGHBOUR_RESIDUAL_OF_NOISE = 1.5
 
 
-def inflate_step_sigmas(
-    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, FloatArray]
-) -> dict[int, FloatArray]:
-    """The noise of each step of a drive besides that of the corners, which adds in squares.
+def step_noise(motions: Mapping[Ends, Motion], frames: int) -> dict[Ends, FloatArray]:
+    """The noise of each triangulated step of a drive besides that of the corners, which adds in squares.
 
     Sigmas ``(6,)`` in radians are of rotation, then of the direction of the earlier camera as the later one sees it,
     where GTSAM perturbs; along it there is no error.
 
     Args:
-        T_previous_current: steps by their order in the drive, neighbours one apart; lengths are not used.
-        own: the sigmas by the covariance of corners.
+        motions: the triangulated steps; lengths are not used.
+        frames: of the drive.
     """
-    if not T_previous_current:
+    if not motions:
         return {}
-    steps = {
-        k: np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), _unit(invert(T)[:3, 3])])
-        for k, T in T_previous_current.items()
-    }
-    jitter = rotation_jitter({k: step[:3] for k, step in steps.items()})
-    jitter = _unexplained(jitter, np.median([own[k][:3] for k in steps], axis=0))
-    noise = {}
-    for k, step in steps.items():
-        residual = _unexplained(neighbour_residual(steps, k), _NEIGHBOUR_RESIDUAL_OF_NOISE * own[k])
-        across = np.sqrt(np.maximum(1.0 - step[3:] ** 2, 0.0))
-        by_jitter = [JITTER_ROTATION * jitter, JITTER_DIRECTION * np.linalg.norm(jitter) * across]
-        noise[k] = np.hypot(np.concatenate(by_jitter), _NEIGHBOUR * residual)
-    return noise
+    place = {ends: row for row, ends in enumerate(links(motions, frames)) if ends in motions}
+    values, own = np.full((2, max(place.values()) + 1, 6), np.nan)  # by their order in the drive
+    for ends, row in place.items():
+        T_previous_current = motions[ends].relative_pose.T_from_to
+        towards = invert(T_previous_current)[:3, 3]
+        values[row, :3] = Rotation.from_matrix(T_previous_current[:3, :3]).as_rotvec()
+        values[row, 3:] = towards / max(float(np.linalg.norm(towards)), 1e-12)
+        own[row] = motions[ends].corner_sigmas
+    jitter = _unexplained(rotation_jitter(values[:, :3]), np.nanmedian(own[:, :3], axis=0))
+    residual = _unexplained(neighbour_residual(values), _NEIGHBOUR_RESIDUAL_OF_NOISE * own)
+    across = np.sqrt(np.maximum(1.0 - values[:, 3:] ** 2, 0.0))
+    by_jitter = np.hstack(
+        [np.tile(JITTER_ROTATION * jitter, (len(values), 1)), JITTER_DIRECTION * np.linalg.norm(jitter) * across]
+    )
+    noise = np.hypot(by_jitter, _NEIGHBOUR * residual)
+    return {ends: noise[row] for ends, row in place.items()}
 
 
-def rotation_jitter(rotations: Mapping[int, FloatArray]) -> FloatArray:
+def rotation_jitter(rotations: FloatArray) -> FloatArray:
     """Sigmas ``(3,)``, radians, of the part of the steps' rotation vectors that no smooth motion explains.
 
     Third differences remove any rotation that changes evenly; their median is robust to single jumps. Zero with few
-    steps.
+    steps. The vectors ``(S, 3)`` are in the order of the drive, NaN where unknown.
     """
-    steps = sorted(k for k in rotations if all(k + n in rotations for n in range(1, 4)))
-    if len(steps) < _LEAST_STEPS:
+    third = rotations[3:] - 3 * rotations[2:-1] + 3 * rotations[1:-2] - rotations[:-3]
+    third = third[np.isfinite(third).all(axis=1)]
+    if len(third) < _LEAST_STEPS:
         return np.zeros(3)
-    third = np.array([rotations[k + 3] - 3 * rotations[k + 2] + 3 * rotations[k + 1] - rotations[k] for k in steps])
-    return np.asarray(mad_sigmas(third) / _THIRD_DIFFERENCE)
+    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(third), axis=0) / _THIRD_DIFFERENCE)
 
 
-def neighbour_residual(values: Mapping[int, FloatArray], step: int) -> FloatArray:
-    """Absolute residual ``(D,)`` of a step's value to the prediction by its neighbours, 0 without neighbours.
+def neighbour_residual(values: FloatArray) -> FloatArray:
+    """Absolute residual ``(S, D)`` of each step's value to the prediction by its neighbours, 0 without neighbours.
 
     Predicted by the two steps before, by the two after, and by one on each side; the median of these is robust
-    to one bad neighbour.
+    to one bad neighbour. Values are in the order of the drive, NaN where unknown.
     """
-    lines = [((-1, 0.5), (1, 0.5)), ((-1, 2.0), (-2, -1.0)), ((1, 2.0), (2, -1.0))]
-    predicted = [
-        sum((weight * values[step + n] for n, weight in line), np.zeros_like(values[step]))
-        for line in lines
-        if all(step + n in values for n, _ in line)
-    ]
-    return np.abs(values[step] - (np.median(predicted, axis=0) if predicted else values[step]))
+    padded = np.pad(values, ((2, 2), (0, 0)), constant_values=np.nan)
+    earlier, before, after, later = (padded[n : n + len(values)] for n in (0, 1, 3, 4))
+    predicted = np.array([0.5 * before + 0.5 * after, 2.0 * before - earlier, 2.0 * after - later])
+    predicted[0] = np.where(np.isnan(predicted).all(axis=0), values, predicted[0])
+    known = np.isfinite(values[:, 0])
+    residual = np.full_like(values, np.nan)
+    residual[known] = np.abs(values[known] - np.nanmedian(predicted[:, known], axis=0))
+    return residual
 
 
 def _unexplained(seen: FloatArray, known: FloatArray) -> FloatArray:
     """The part of a deviation ``(D,)`` that known sigmas ``(D,)`` do not explain."""
     return np.asarray(np.sqrt(np.maximum(seen**2 - known**2, 0.0)))
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,7 @@ class Matches:
 
     Learned depth is without its bias and has the relative ``depth_sigma`` ``(M,)``; by it the corners ``on_road``
     ``(M,)`` lie at the height of the road. ``weights`` ``(M,)`` in (0, 1] are lower on dynamic objects. The motion that
-    most of those with ``votes`` ``(M,)`` agree on is chosen.
+    most of those with ``votes`` ``(M,)`` agree on is chosen. ``focal_px`` is the focal length, pixels.
     """
 
     rays_previous: FloatArray
@@ -69,11 +69,38 @@ class Matches:
     on_road: NDArray[np.bool_]
     weights: FloatArray
     votes: NDArray[np.bool_]
+    focal_px: float
 
     def by_geometry_alone(self) -> Matches:
         """The same corners without what learned depth and the steps before say of them."""
         everyone = np.ones(len(self.weights))
         return replace(self, depth_previous=np.nan * everyone, weights=everyone, votes=everyone > 0)
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """Those of the corners under any motion."""
+        return Residuals(self.rays_previous, self.rays_current, self.depth_previous, self.focal_px)
+
+    def length(self, unit_pose: UnitRelativePose) -> float | None:
+        """Length in the unit of learned depth, by corners with parallax near their epipolar lines; None with few.
+
+        Without learned depth the length does not matter.
+        """
+        if not np.isfinite(self.depth_previous).any():
+            return 1.0
+        ratios, shift_px = self.ratios(unit_pose)
+        return weighted_median(ratios, shift_px) if len(ratios) >= _LEAST_POINTS else None
+
+    def ratios(self, unit_pose: UnitRelativePose) -> tuple[FloatArray, FloatArray]:
+        """Learned over triangulated depth of corners with parallax near their epipolar lines, and that parallax."""
+        distance, _ = self.residuals.across(unit_pose, tangent_of(unit_pose.direction))
+        depth = triangulated_depth(self.rays_previous, self.rays_current, unit_pose)
+        rotated = unit_pose.R_current_previous @ self.rays_previous.T
+        shift = self.rays_current.T[:2] - rotated[:2] / np.maximum(rotated[2], 1e-6)
+        shift_px = np.hypot(*shift) * self.focal_px
+        usable = (np.abs(distance) < INLIER_PX) & (depth > 0) & (shift_px > 1.0)
+        usable &= np.isfinite(self.depth_previous)
+        return np.asarray(self.depth_previous[usable] / depth[usable]), np.asarray(shift_px[usable])
 
 
 @dataclass(frozen=True)
@@ -92,150 +119,117 @@ class TwoViewEstimate:
     agreeing: NDArray[np.bool_]
 
 
-class TwoViewEstimator:
-    """Estimates the motions of one drive; stateless, the history is an argument."""
+def estimate(matches: Matches, history: MotionHistory, seed: int = 0) -> TwoViewEstimate | None:
+    """Rotation and direction of the next motion; None without a consensus. ``seed`` is that of RANSAC."""
+    votes = matches.votes
+    reliable = votes & (matches.weights >= _LEAST_PROPOSING_WEIGHT)
+    first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
+    depth = matches.depth_previous[reliable]
+    prior, least = history.prior(), _EARLY_EXIT_INLIER_RATIO
+    usual = _refined(matches, history.last, prior)
+    if usual is not None and usual.agreeing[votes].mean() >= least:
+        return usual
+    tolerance = _RESECTION_PX / matches.focal_px
+    by_points = cache(lambda: unit_pose_by_pnp(first, second, depth, tolerance, seed))
+    proposed = unit_pose_by_essential(first, second, INLIER_PX / matches.focal_px, seed)
+    if history.last is None and proposed is not None:
+        matches = _with_first_sigma(matches, [proposed, by_points()])
+    best = _refined(matches, proposed, prior)
+    candidates = [usual, best]
+    if best is None or best.agreeing[votes].mean() < least:
+        candidates.append(_refined(matches, by_points(), prior))
+    estimates = [candidate for candidate in candidates if candidate is not None]
+    if not estimates:
+        return None
+    return max(estimates, key=lambda candidate: _support(candidate, votes, prior))
 
-    def __init__(self, focal_px: float, seed: int = 0) -> None:
-        self._focal_px = focal_px
-        self._seed = seed
 
-    def estimate(self, matches: Matches, history: MotionHistory) -> TwoViewEstimate | None:
-        """Rotation and direction of the next motion; None without a consensus."""
-        votes = matches.votes
-        reliable = votes & (matches.weights >= _LEAST_PROPOSING_WEIGHT)
-        first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
-        depth = matches.depth_previous[reliable]
-        prior, least = history.prior(), _EARLY_EXIT_INLIER_RATIO
-        usual = self._refined(matches, history.last, prior)
-        if usual is not None and usual.agreeing[votes].mean() >= least:
-            return usual
-        tolerance = _RESECTION_PX / self._focal_px
-        by_points = cache(lambda: unit_pose_by_pnp(first, second, depth, tolerance, self._seed))
-        proposed = unit_pose_by_essential(first, second, INLIER_PX / self._focal_px, self._seed)
-        if history.last is None and proposed is not None:
-            matches = self._with_first_sigma(matches, [proposed, by_points()])
-        best = self._refined(matches, proposed, prior)
-        candidates = [usual, best]
-        if best is None or best.agreeing[votes].mean() < least:
-            candidates.append(self._refined(matches, by_points(), prior))
-        estimates = [candidate for candidate in candidates if candidate is not None]
-        if not estimates:
+def refined(matches: Matches, start: UnitRelativePose) -> TwoViewEstimate | None:
+    """The motion refined from a well-known ``start``.
+
+    Learned depth has a small weight: it is needed only to choose between motions.
+    """
+    matches = replace(matches, depth_sigma=_PATCH_WIDENING * matches.depth_sigma)
+    return _refined(matches, start, MotionPrior(start.direction, AXIS_SIGMA))
+
+
+def _refined(matches: Matches, start: UnitRelativePose | None, prior: MotionPrior) -> TwoViewEstimate | None:
+    """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
+
+    Across its epipolar line a corner has the noise of the image, along it that of learned depth. A corner with
+    parallax is an inlier whatever its learned depth says: its own shift is the better measurement. Without parallax
+    the corner is far away or moves along with the camera, which learned depth alone can tell apart.
+    """
+    if start is None:
+        return None
+    residuals, begin = matches.residuals, matches.length(start)
+    if begin is None:
+        return None
+    unit_pose, length = start, begin
+    known = np.isfinite(matches.depth_previous)
+    for iteration in range(_ITERATIONS):
+        tangent = tangent_of(unit_pose.direction)
+        across, by_motion = residuals.across(unit_pose, tangent)
+        along, by_all, shift_px = residuals.along(unit_pose, length, tangent)
+        near = np.abs(across) < INLIER_PX
+        sigma = max(mad_sigma(across[near]), 1e-3 * INLIER_PX) if near.any() else INLIER_PX
+        sigma_along = np.hypot(_ALONG_PX, matches.depth_sigma * shift_px)
+        seen_px = shift_px - along
+        agreeing, inliers = _inliers(matches, near, shift_px, seen_px, _PARALLAX_SIGMAS * sigma)
+        if inliers.sum() < _LEAST_POINTS:
             return None
-        return max(estimates, key=lambda candidate: _support(candidate, votes, prior))
+        weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
+        weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
+        weights = weights / sigma**2
+        normal = (weights_along * by_all) @ by_all.T + 1e-9 * np.eye(6)
+        normal[:5, :5] += (weights * by_motion) @ by_motion.T
+        gradient = by_all @ (weights_along * along)
+        gradient[:5] += by_motion @ (weights * across)
+        deviation = unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
+        normal[3:5, 3:5] += np.eye(2) / prior.axis_sigma**2
+        gradient[3:5] += tangent.T @ deviation / prior.axis_sigma**2
+        step = np.asarray(-_OVERSTEP * np.linalg.solve(normal, gradient), np.float64)
+        if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < _CONVERGED:
+            break
+        direction = unit_pose.direction + tangent @ step[3:5]
+        R_current_previous = compose(rotation_matrix(step[:3]), unit_pose.R_current_previous)
+        unit_pose = UnitRelativePose(R_current_previous, direction / np.linalg.norm(direction))
+        length = max(length + float(step[5]), 0.2 * length)
+    lift = np.zeros((6, 5))
+    lift[:3, :3], lift[3:, 3:] = np.eye(3), tangent
+    covariance = lift @ np.linalg.inv(normal)[:5, :5] @ lift.T
+    return TwoViewEstimate(unit_pose, covariance, sigma, inliers, agreeing)
 
-    def refined(self, matches: Matches, start: UnitRelativePose) -> TwoViewEstimate | None:
-        """The motion refined from a well-known ``start``.
 
-        Learned depth has a small weight: it is needed only to choose between motions.
-        """
-        matches = replace(matches, depth_sigma=_PATCH_WIDENING * matches.depth_sigma)
-        return self._refined(matches, start, MotionPrior(start.direction, AXIS_SIGMA))
+def _inliers(
+    matches: Matches, near: NDArray[np.bool_], shift_px: FloatArray, seen_px: FloatArray, parallax_px: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
 
-    def _residuals(self, matches: Matches) -> Residuals:
-        return Residuals(matches.rays_previous, matches.rays_current, matches.depth_previous, self._focal_px)
+    The majority of the parallax in the image decides on the length by which learned depth is compared, not the
+    majority of corners: those far away are many at times, and their depth is the least certain. Shifts ``(M,)``
+    along the lines are ``shift_px`` by learned depth and ``seen_px``; larger ones than ``parallax_px`` are inliers
+    against it.
+    """
+    known = np.isfinite(matches.depth_previous)
+    measured = near & known & (seen_px > 1.0) & (shift_px > 0)
+    by_parallax = weighted_median(seen_px[measured] / shift_px[measured], seen_px[measured]) if measured.any() else 1.0
+    expected_px = by_parallax * shift_px
+    tolerance_px = _ALONG_SIGMAS * np.hypot(_ALONG_PX, matches.depth_sigma * expected_px)
+    agreeing = near & (~known | (np.abs(seen_px - expected_px) < tolerance_px))
+    contradicting = near & ~agreeing
+    pixels = matches.focal_px * matches.rays_previous[:, :2]
+    moving = moving_corners(pixels, matches.on_road, agreeing, contradicting, expected_px, seen_px)
+    return agreeing, agreeing | (contradicting & ~moving & (seen_px > parallax_px))
 
-    def _refined(self, matches: Matches, start: UnitRelativePose | None, prior: MotionPrior) -> TwoViewEstimate | None:
-        """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
 
-        Across its epipolar line a corner has the noise of the image, along it that of learned depth. A corner with
-        parallax is an inlier whatever its learned depth says: its own shift is the better measurement. Without parallax
-        the corner is far away or moves along with the camera, which learned depth alone can tell apart.
-        """
-        if start is None:
-            return None
-        residuals = self._residuals(matches)
-        begin = self._length(matches, start, residuals)
-        if begin is None:
-            return None
-        unit_pose, length = start, begin
-        known = np.isfinite(matches.depth_previous)
-        for iteration in range(_ITERATIONS):
-            tangent = tangent_of(unit_pose.direction)
-            across, by_motion = residuals.across(unit_pose, tangent)
-            along, by_all, shift_px = residuals.along(unit_pose, length, tangent)
-            near = np.abs(across) < INLIER_PX
-            sigma = max(mad_sigma(across[near]), 1e-3 * INLIER_PX) if near.any() else INLIER_PX
-            sigma_along = np.hypot(_ALONG_PX, matches.depth_sigma * shift_px)
-            seen_px = shift_px - along
-            agreeing, inliers = self._inliers(matches, near, shift_px, seen_px, _PARALLAX_SIGMAS * sigma)
-            if inliers.sum() < _LEAST_POINTS:
-                return None
-            weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
-            weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
-            weights = weights / sigma**2
-            normal = (weights_along * by_all) @ by_all.T + 1e-9 * np.eye(6)
-            normal[:5, :5] += (weights * by_motion) @ by_motion.T
-            gradient = by_all @ (weights_along * along)
-            gradient[:5] += by_motion @ (weights * across)
-            deviation = unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
-            normal[3:5, 3:5] += np.eye(2) / prior.axis_sigma**2
-            gradient[3:5] += tangent.T @ deviation / prior.axis_sigma**2
-            step = np.asarray(-_OVERSTEP * np.linalg.solve(normal, gradient), np.float64)
-            if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < _CONVERGED:
-                break
-            direction = unit_pose.direction + tangent @ step[3:5]
-            R_current_previous = compose(rotation_matrix(step[:3]), unit_pose.R_current_previous)
-            unit_pose = UnitRelativePose(R_current_previous, direction / np.linalg.norm(direction))
-            length = max(length + float(step[5]), 0.2 * length)
-        lift = np.zeros((6, 5))
-        lift[:3, :3], lift[3:, 3:] = np.eye(3), tangent
-        covariance = lift @ np.linalg.inv(normal)[:5, :5] @ lift.T
-        return TwoViewEstimate(unit_pose, covariance, sigma, inliers, agreeing)
-
-    def _inliers(
-        self, matches: Matches, near: NDArray[np.bool_], shift_px: FloatArray, seen_px: FloatArray, parallax_px: float
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
-
-        The majority of the parallax in the image decides on the length by which learned depth is compared, not the
-        majority of corners: those far away are many at times, and their depth is the least certain. Shifts ``(M,)``
-        along the lines are ``shift_px`` by learned depth and ``seen_px``; larger ones than ``parallax_px`` are inliers
-        against it.
-        """
-        known = np.isfinite(matches.depth_previous)
-        measured = near & known & (seen_px > 1.0) & (shift_px > 0)
-        by_parallax = (
-            weighted_median(seen_px[measured] / shift_px[measured], seen_px[measured]) if measured.any() else 1.0
-        )
-        expected_px = by_parallax * shift_px
-        tolerance_px = _ALONG_SIGMAS * np.hypot(_ALONG_PX, matches.depth_sigma * expected_px)
-        agreeing = near & (~known | (np.abs(seen_px - expected_px) < tolerance_px))
-        contradicting = near & ~agreeing
-        pixels = self._focal_px * matches.rays_previous[:, :2]
-        moving = moving_corners(pixels, matches.on_road, agreeing, contradicting, expected_px, seen_px)
-        return agreeing, agreeing | (contradicting & ~moving & (seen_px > parallax_px))
-
-    def _with_first_sigma(self, matches: Matches, motions: Sequence[UnitRelativePose | None]) -> Matches:
-        """Until the drive has told the error of learned depth, it is the least under a motion that most corners fit."""
-        residuals = self._residuals(matches)
-        ratios = [self._ratios(matches, motion, residuals)[0] for motion in motions if motion is not None]
-        least = max(_LEAST_POINTS, _COMPARABLE_SUPPORT * max(map(len, ratios), default=0))
-        logarithms = [np.log(of_motion) for of_motion in ratios if len(of_motion) >= least]
-        error = min((mad_sigma(logarithm - np.median(logarithm)) for logarithm in logarithms), default=0.0)
-        return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
-
-    def _length(self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals) -> float | None:
-        """Length in the unit of learned depth, by corners with parallax near their epipolar lines; None with few.
-
-        Without learned depth the length does not matter.
-        """
-        if not np.isfinite(matches.depth_previous).any():
-            return 1.0
-        ratios, shift_px = self._ratios(matches, unit_pose, residuals)
-        return weighted_median(ratios, shift_px) if len(ratios) >= _LEAST_POINTS else None
-
-    def _ratios(
-        self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals
-    ) -> tuple[FloatArray, FloatArray]:
-        """Learned over triangulated depth of corners with parallax near their epipolar lines, and that parallax."""
-        distance, _ = residuals.across(unit_pose, tangent_of(unit_pose.direction))
-        depth = triangulated_depth(matches.rays_previous, matches.rays_current, unit_pose)
-        rotated = unit_pose.R_current_previous @ matches.rays_previous.T
-        shift = matches.rays_current.T[:2] - rotated[:2] / np.maximum(rotated[2], 1e-6)
-        shift_px = np.hypot(*shift) * self._focal_px
-        usable = (np.abs(distance) < INLIER_PX) & (depth > 0) & (shift_px > 1.0)
-        usable &= np.isfinite(matches.depth_previous)
-        return np.asarray(matches.depth_previous[usable] / depth[usable]), np.asarray(shift_px[usable])
+def _with_first_sigma(matches: Matches, motions: Sequence[UnitRelativePose | None]) -> Matches:
+    """Until the drive has told the error of learned depth, it is the least under a motion that most corners fit."""
+    ratios = [matches.ratios(motion)[0] for motion in motions if motion is not None]
+    least = max(_LEAST_POINTS, _COMPARABLE_SUPPORT * max(map(len, ratios), default=0))
+    logarithms = [np.log(of_motion) for of_motion in ratios if len(of_motion) >= least]
+    error = min((mad_sigma(logarithm - np.median(logarithm)) for logarithm in logarithms), default=0.0)
+    return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
 
 
 def _support(candidate: TwoViewEstimate, votes: NDArray[np.bool_], prior: MotionPrior) -> float:

@@ -13,7 +13,7 @@ import pytest
 from erfsfm.common.command_line import Terminal
 from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
-from slam.frontend.drive import Drive, Segment
+from slam.frontend.drive import Drive, Segment, frame_support
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.focal_length import FocalLength
@@ -87,12 +87,11 @@ def driven(
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
         roads=[Failed("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
+        focal_length=FocalLength(1e6, -1e6 * focal),
     )
-    focal_length = FocalLength(1e6, -1e6 * focal)
     camera = replace(CAMERA, is_guess=is_guess)
-    by_frame = agreement.frame_support(range(len(drive)), drive.motions)
     ends = [pose.ends for pose in poses[:contradicted]]
-    found = agreement.of_images(drive, DepthError(), focal_length, camera, by_frame, ends, needs_road=True)
+    found = agreement.of_images(drive, camera, ends, needs_road=True)
     steps = STEPS.copy()
     steps[:aside, :3, 3] = [0.9, 0.0, 0.0]
     sure = agreement.confidence([*found, agreement.of_directions(se3.chain(steps))], is_metric=True, is_carried=False)
@@ -151,4 +150,4 @@ def test_two_contradictions_are_two_warnings(
 
 def test_a_frame_without_a_motion_has_no_support() -> None:
     motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
-    assert agreement.frame_support(range(3), motions).tolist() == [0.7, 0.7, 0.0]
+    assert frame_support(range(3), motions).tolist() == [0.7, 0.7, 0.0]

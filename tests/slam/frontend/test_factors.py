@@ -10,7 +10,7 @@ from oracle import snippets_of
 
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.factors import chain_odometry, make_factors, with_lidar
+from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
 from slam.frontend.visual.motion import Motion
@@ -44,7 +44,7 @@ def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
 
 
 def factors(measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = ()) -> list[RelativePose]:
-    return with_lidar(make_factors(measured, scale), lidar)
+    return make_factors(measured, scale, lidar)
 
 
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]

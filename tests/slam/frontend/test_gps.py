@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from slam.config.sections import GpsConfig
-from slam.frontend.gps import fixes_of, scale_by_gps
-from slam.frontend.scale.scale_estimate import ScaleEstimate
+from slam.frontend.gps import GpsFixes
+from slam.frontend.scale.metric_scale import ScaleEstimate
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
@@ -30,9 +30,7 @@ def scale(positions: FloatArray, seed: int) -> ScaleEstimate | Failed:
     track = GpsTrack(seconds, LocalFrame(np.array([48.0, 11.0, 500.0])).places(enu + errors), np.ones(len(seconds)))
     T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
     T_world_camera[:, :3, 3] = positions
-    fixes = fixes_of(track, stamps, CONFIG)
-    assert not isinstance(fixes, Failed)
-    return scale_by_gps(fixes, T_world_camera, stamps)
+    return GpsFixes(track, stamps, CONFIG, "gps").scale(T_world_camera)
 
 
 def straight(length_m: float) -> FloatArray:

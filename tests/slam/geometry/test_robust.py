@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.geometry.robust import mad_sigma, mad_sigmas, median, weighted_median
+from slam.geometry.robust import mad_sigma, median, weighted_median
 
 
 def test_the_sigma_of_normal_errors_survives_a_third_of_outliers() -> None:
     errors = np.random.default_rng(0).normal(scale=2.0, size=(20_000, 2))
-    assert mad_sigmas(errors) == pytest.approx([2.0, 2.0], rel=0.02)
     spoilt = np.concatenate([errors[:, 0], np.full(2_000, 1e6)])
     assert mad_sigma(spoilt) == pytest.approx(2.0, rel=0.2)
 

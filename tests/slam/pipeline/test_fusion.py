@@ -10,7 +10,6 @@ import pytest
 from erfsfm.mvs.fusion import DepthFusion
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
-from slam.frontend.visual.depth_error import DepthError
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.fusion import keyframe_depths
 from slam.runtime.errors import Failed
@@ -32,7 +31,7 @@ def depths(step: float, guess_sigma: float | None, refined: bool = True) -> Call
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)
     scale, decide = np.full(FRAMES, 2.0), DepthFusion("default").decide if refined else None
-    return keyframe_depths(drive, scale, T_world_camera, DepthError(), CAMERA, decide, guess_sigma)
+    return keyframe_depths(drive, scale, T_world_camera, CAMERA, decide, guess_sigma)
 
 
 def test_what_no_neighbour_measures_has_the_sigma_of_a_guess() -> None:

@@ -64,7 +64,7 @@ KEYFRAMES_ALONE = SlamConfig(
 
 
 def completed(observer: Observer) -> Drive:
-    drive = observer.observations().drive
+    drive = observer.measured()
     return complete_drive(drive, 4, keyframe_poses(drive.maps, room.INTRINSICS))
 
 
@@ -103,7 +103,7 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
         for k, T in enumerate(truth):
             observer.add(k, room.frame(k, T))
             if k in interrupted:
-                observer.observations()
+                observer.measured()
         drive = completed(observer)
     keyframes = drive.maps[-1].map.keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
@@ -132,11 +132,11 @@ def test_observations_stay_while_frames_follow() -> None:
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k in range(26):
             observer.add(k, room.frame(k, truth[k]))
-        drive = observer.observations().drive
+        drive = observer.measured()
         before = pickle.dumps(drive)
         for k in range(26, 40):
             observer.add(k, room.frame(k, truth[k]))
-        assert len(observer.observations().drive) == 40
+        assert len(observer.measured()) == 40
     assert drive.maps and drive.events and pickle.dumps(drive) == before
 
 

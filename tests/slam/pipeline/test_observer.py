@@ -17,11 +17,12 @@ from slam.config.sections import SlamConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend import tracking
+from slam.frontend.drive import Drive
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.observer import Observations, Observer
+from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline, read_frame
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.timing import Stopwatch
@@ -197,20 +198,20 @@ def test_an_undamaged_drive_has_no_interpolated_frames(caplog: pytest.LogCapture
     assert result.drive.doubled == [] and "exposure" not in caplog.text
 
 
-def observe(frames: int, damage: Damage, bad: range, *overrides: str) -> Observations:
+def observe(frames: int, damage: Damage, bad: range, *overrides: str) -> Drive:
     """So many frames of a damaged drive."""
     sequence = Damaged(street(), damage, bad)
     config = config_with("mapping.enabled=false", "visual_odometry.enabled=false", *overrides)
     with Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) as observer:
         for index in range(frames):
             observer.add(index, read_frame(sequence, index))
-        return observer.observations()
+        return observer.measured()
 
 
 def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
     """Thirty-four missing in a row are a gap in time; the thirty-first unreadable one is an error."""
-    assert sorted(observe(FRAMES, missing, range(4, 38)).drive.unusable) == list(range(4, 38))
-    assert sorted(observe(34, unreadable, range(4, 38)).drive.unusable) == list(range(4, 34))
+    assert sorted(observe(FRAMES, missing, range(4, 38)).unusable) == list(range(4, 38))
+    assert sorted(observe(34, unreadable, range(4, 38)).unusable) == list(range(4, 34))
     with pytest.raises(SequenceError, match=r"image 34\.png is truncated"):
         observe(35, unreadable, range(4, 38))
 
@@ -240,7 +241,7 @@ def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) ->
             going_on.add(index, frame)
             flushed.add(index, Frame(index, frame.stamp, frame.image))
             flushed.flush()
-            assert len(flushed.observations().drive) == flushed.frames == going_on.frames == index + 1
+            assert len(flushed.measured()) == flushed.frames == going_on.frames == index + 1
         assert_same(going_on, flushed)
 
 

@@ -8,11 +8,11 @@ from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
 from slam.frames import Image, Intrinsics
+from slam.frontend.gps import Location
 from slam.geometry import se3
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.positioning import Location
 from slam.pipeline.run import SlamPipeline
 from slam.runtime.errors import ConfigError, Failed, SlamError
 from slam.sequences.recording import RecordedSequence

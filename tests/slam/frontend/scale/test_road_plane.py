@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from slam.frames import DepthMap, Intrinsics
+from slam.frontend.scale.metric_scale import ScaleEstimate, scale_from_road
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
-from slam.frontend.scale.scale_estimate import ScaleEstimate, scale_from_road
 from slam.frontend.visual.depth_error import DepthError
 from slam.runtime.errors import Failed
 

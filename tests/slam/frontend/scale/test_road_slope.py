@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends, RelativePose
-from slam.frontend.scale.road_homography import RoadStep
-from slam.frontend.scale.road_slope import with_slope
+from slam.frontend.scale.road_homography import RoadStep, with_slope
 from slam.frontend.visual.motion import Motion, Steps
 from slam.geometry.se3 import FloatArray, invert, make
 

@@ -11,7 +11,7 @@ import pytest
 from slam.frames import Frame, Intrinsics
 from slam.frontend.visual.motion import Motion, MotionHistory
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, TwoViewEstimator
+from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, estimate, refined
 from slam.geometry import se3
 from slam.geometry.epipolar import UnitRelativePose, unit_pose_by_essential
 from slam.simulation.options import SimulationOptions
@@ -24,7 +24,7 @@ NO_HISTORY = MotionHistory()
 
 def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int = 0) -> TwoViewEstimate:
     """The motion of one step after some history."""
-    found = TwoViewEstimator(FOCAL_PX, seed=seed).estimate(matches, history)
+    found = estimate(matches, history, seed)
     assert found is not None
     return found
 
@@ -32,7 +32,8 @@ def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int =
 def matches_of(previous: np.ndarray, current: np.ndarray, learned: np.ndarray) -> Matches:
     count = len(learned)
     sigma = np.full(count, DEPTH_RELATIVE_SIGMA)
-    return Matches(previous, current, learned, sigma, np.zeros(count, bool), np.ones(count), np.ones(count, bool))
+    road, everyone = np.zeros(count, bool), np.ones(count, bool)
+    return Matches(previous, current, learned, sigma, road, np.ones(count), everyone, FOCAL_PX)
 
 
 def corner_with_a_car(seed: int, turn_deg: float = 4.0, error: float = 0.15) -> tuple[Matches, np.ndarray]:
@@ -104,9 +105,9 @@ def test_a_known_motion_is_refined():
     direction = T_current_previous[:3, 3] / np.linalg.norm(T_current_previous[:3, 3])
     off = se3.from_rotation_vector(np.deg2rad([0.05, 0.1, -0.05]), np.zeros(3))[:3, :3]
     start = UnitRelativePose(off @ T_current_previous[:3, :3], direction)
-    refined = TwoViewEstimator(FOCAL_PX).refined(matches, start)
-    assert refined is not None
-    assert angle_deg(refined.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.06
+    found = refined(matches, start)
+    assert found is not None
+    assert angle_deg(found.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.06
 
 
 def test_the_history_of_a_drive_chooses_between_motions():
@@ -129,7 +130,7 @@ def test_without_common_points_there_is_no_motion():
     rng = np.random.default_rng(0)
     rays = [np.column_stack([rng.uniform(-0.8, 0.8, (12, 2)), np.ones(12)]) for _ in range(2)]
     matches = matches_of(*rays, np.full(12, np.nan))
-    assert TwoViewEstimator(FOCAL_PX).estimate(matches, NO_HISTORY) is None
+    assert estimate(matches, NO_HISTORY) is None
 
 
 @pytest.mark.parametrize("first", [264])
@@ -165,10 +166,9 @@ def plain_road(seed: int, length: float = 0.9) -> tuple[Matches, np.ndarray, np.
 
 def test_learned_depth_that_sees_far_things_too_near_casts_out_no_near_corner():
     errors_deg, kept = [], []
-    estimator = TwoViewEstimator(720.0)
     for seed in range(60):
         matches, near, T_current_previous = plain_road(seed)
-        found = estimator.estimate(matches, NO_HISTORY)
+        found = estimate(replace(matches, focal_px=720.0), NO_HISTORY)
         assert found is not None
         errors_deg.append(angle_deg(found.unit_pose.R_current_previous, T_current_previous[:3, :3]))
         kept.append(found.inliers[near].mean())

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics, View
+from slam.frontend.keyframes.local_map import LocalMap, TrackIds
+from slam.frontend.tracking import Pixels
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches
@@ -18,35 +17,23 @@ _PLACES_TRIED = 6
 _LEAST_POINTS = 30
 
 
-@dataclass(frozen=True)
-class Relocalised:
-    """``T_camera_map`` and the corners that see points: ``corners`` ``(M,)`` of the image.
-
-    ``keyframes`` ``(M,)`` are the rows of keyframes with these points and ``keyframe_corners`` ``(M,)`` theirs.
-    """
-
-    T_camera_map: FloatArray
-    corners: NDArray[np.intp]
-    keyframes: NDArray[np.intp]
-    keyframe_corners: NDArray[np.intp]
-
-    @property
-    def nearest(self) -> int:
-        """The row of the keyframe with most of the points."""
-        return int(np.bincount(self.keyframes).argmax())
-
-
 class Relocaliser:
     """Finds single images among the keyframes of one map."""
 
-    def __init__(self, views: Sequence[View], T_map_camera: FloatArray, intrinsics: Intrinsics, seed: int = 0) -> None:
-        """Index keyframes, at least one, with points in the unit of the map and poses ``(V, 4, 4)``."""
-        self._views, self._T_map_camera, self._intrinsics = views, T_map_camera, intrinsics
-        self._index = PlaceIndex(views)
+    def __init__(self, local: LocalMap, intrinsics: Intrinsics, seed: int = 0) -> None:
+        """Index the keyframes of the map, at least one; ``seed`` is that of RANSAC."""
+        self.local, self._intrinsics = local, intrinsics
+        self._views, self._T_map_camera = local.views(local.points), local.T_world_camera
+        self._index = PlaceIndex(self._views)
         self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
 
-    def locate(self, image: View) -> Relocalised | None:
-        """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few."""
+    def locate(self, image: View) -> tuple[FloatArray, TrackIds, Pixels, int] | None:
+        """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few.
+
+        Returns:
+            ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)`` where the image sees
+            them, and the frame of the keyframe with most of them.
+        """
         keyframes, rows, points = self._matched(image)
         best: Sighting | None = None
         for keyframe in np.unique(keyframes):
@@ -65,7 +52,11 @@ class Relocaliser:
         kept = kept[first]
         if len(kept) < _LEAST_POINTS:
             return None
-        return Relocalised(best.T_camera_points, rows[kept, 1], keyframes[kept], rows[kept, 0])
+        seen_by = zip(keyframes[kept].tolist(), rows[kept, 0].tolist(), strict=True)
+        tracks = np.array([self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by])
+        tracks, once = np.unique(tracks, return_index=True)
+        place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
+        return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
 
     def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
         """Keyframes ``(M,)``, rows of their corners and of the image's ``(M, 2)``, and points in the map ``(M, 3)``."""

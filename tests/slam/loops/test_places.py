@@ -1,7 +1,7 @@
 import numpy as np
 
 from slam.geometry.se3 import apply, from_rotation_vector, invert
-from slam.geometry.triangulation import reprojection_errors, triangulate
+from slam.loops.places import reprojection_errors, triangulate
 
 
 def test_points_and_angles_of_exact_rays() -> None:

@@ -90,7 +90,7 @@ def options_of_drives(
     load_config(config, overrides)
     record_of_whole_weights(weights or "default")
     frame_range(frames or ":", EVERYTHING)
-    words = ["--seed", str(seed), "--device", device]
+    words = []
     for override in overrides:
         kind, colon, path = override.partition(":")
         is_path = kind.startswith("depth.source=") and bool(colon)
@@ -99,7 +99,9 @@ def options_of_drives(
         words += ["--weights", from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights]
     if config is not None:
         words += ["--config", from_anywhere(config) if Path(config).is_file() else config]
-    return words if frames is None else [*words, "--frames", frames]
+    if frames is not None:
+        words += ["--frames", frames]
+    return [*words, "--seed", str(seed), "--device", device]
 
 
 def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:

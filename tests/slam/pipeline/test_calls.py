@@ -25,7 +25,7 @@ FRAMES = 30
 MOST = {
     "depth": 0.6,
     "snippet": 0.3,
-    "calcOpticalFlowPyrLK": 6.0,
+    "calcOpticalFlowPyrLK": 5.0,
     "findEssentialMat": 0.5,
     "goodFeaturesToTrack": 12.1,  # one a tile
     "view": 0.3,

@@ -150,9 +150,8 @@ def of_images(drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], ne
         figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
         figure += f", which end at frames {named([last for _, last in contradicted])}" if contradicted else ""
         found.append(("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure))
-    if (support := drive.support) is not None and (
-        drive.motions or drive.failures
-    ):  # else nothing was asked of the corners
+    corners_were_asked = bool(drive.motions or drive.failures)
+    if corners_were_asked and (support := drive.support) is not None:
         found.append(("the overlap of images", *_overlap(support)))
     if needs_road and steps >= _LEAST:
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD

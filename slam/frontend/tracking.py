@@ -79,8 +79,6 @@ def track(
         search: by which windows.
         guesses: where the search begins ``(M, 2)``; None is at the pixels themselves.
     """
-    if not len(pixels):
-        return pixels, np.zeros(0, np.bool_)
     guesses = pixels if guesses is None else guesses
     moved, forward = _lucas_kanade(first, second, pixels, guesses, search.side, search.levels, search.limits)
     levels, limits = search.back or (search.levels, search.limits)
@@ -93,6 +91,8 @@ def track(
 def _lucas_kanade(
     first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, side: int, levels: int, limits: tuple[int, float]
 ) -> tuple[Pixels, NDArray[np.bool_]]:
+    if not len(pixels):
+        return pixels, np.zeros(0, np.bool_)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         first,
         second,
@@ -216,8 +216,6 @@ class CornerTracker:
         points, by_steps = corners[0][rows], arrived[0][rows_arrived]
 
         def find() -> Tracks:
-            if not len(points):
-                return Tracks(np.zeros((0, 2)), np.zeros((0, 2)), track_ids, 0)
             images = previous.grey, predicted_flow.warp_back(current.grey)
             pixels, kept = _lucas_kanade(*images, points, points, OF_STEPS.side, _PREDICTED_LEVELS, OF_STEPS.limits)
             pixels = predicted_flow.in_current(pixels)

@@ -121,14 +121,13 @@ class TwoViewEstimate:
 
 def estimate(matches: Matches, history: MotionHistory, seed: int = 0) -> TwoViewEstimate | None:
     """Rotation and direction of the next motion; None without a consensus. ``seed`` is that of RANSAC."""
-    votes = matches.votes
-    reliable = votes & (matches.weights >= _LEAST_PROPOSING_WEIGHT)
-    first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
-    depth = matches.depth_previous[reliable]
-    prior, least = history.prior(), _EARLY_EXIT_INLIER_RATIO
+    votes, prior, least = matches.votes, history.prior(), _EARLY_EXIT_INLIER_RATIO
     usual = _refined(matches, history.last, prior)
     if usual is not None and usual.agreeing[votes].mean() >= least:
         return usual
+    reliable = votes & (matches.weights >= _LEAST_PROPOSING_WEIGHT)
+    first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
+    depth = matches.depth_previous[reliable]
     tolerance = _RESECTION_PX / matches.focal_px
     by_points = cache(lambda: unit_pose_by_pnp(first, second, depth, tolerance, seed))
     proposed = unit_pose_by_essential(first, second, INLIER_PX / matches.focal_px, seed)

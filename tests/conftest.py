@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import random
@@ -20,10 +21,19 @@ os.environ["MPLBACKEND"] = "Agg"
 # The font cache is costly to build: it outlives the session, unlike the home folder below.
 os.environ.setdefault("MPLCONFIGDIR", str(Path(tempfile.gettempdir()) / f"erfsfm-slam-matplotlib-{os.getuid()}"))
 
+# Torch and two thousand tests stay for the session: no collection of garbage looks through them again.
+gc.disable()
+
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 import erfsfm  # noqa: E402, F401  before any test module loads OpenCV, which then reads the largest image from it
+
+
+def pytest_collection_finish() -> None:
+    """All that is imported and collected leaves the heap that is searched for garbage."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

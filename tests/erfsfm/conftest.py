@@ -154,7 +154,9 @@ _CONFIGURATIONS = {
 
 @pytest.fixture(
     params=[
-        pytest.param(name, marks=pytest.mark.slow if re.match("table[12]", name) else ())  # table 3 has both networks
+        pytest.param(
+            name, marks=pytest.mark.slow if re.match("table[12]|erf-|default-gpu", name) else ()
+        )  # table 3 has both networks
         for name in _CONFIGURATIONS.values()
     ]
 )

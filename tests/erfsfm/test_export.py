@@ -82,7 +82,8 @@ def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "pose", ["erf-posenet-dilated", "erf-posenet-dfcv2", pytest.param("erf-posenet-dfc", marks=pytest.mark.slow)]
+    "pose",
+    ["erf-posenet-dilated", *(pytest.param(f"erf-posenet-{n}", marks=pytest.mark.slow) for n in ("dfc", "dfcv2"))],
 )
 def test_paper_fidelity(tmp_path: Path, pose: str) -> None:
     model = fresh(pose=pose, fidelity="paper", width=160, height=128)

@@ -47,6 +47,7 @@ PROGRAMS = ("erfsfm", "erfsfm-slam", "make", "pip", "python", *EVO)
 ADVICE = "add what it names to the workspace of this test, or a line to SHORTER or NOT_RUN"
 
 WIDTH, HEIGHT, FRAMES, FIRST_RUN, RAW_FRAMES = 208, 64, 16, 12, 9
+SIZE = f"--width {WIDTH} --height {HEIGHT} --route straight"
 
 SHORTER: tuple[tuple[str, str], ...] = (
     # (pattern, replacement), applied to the whole command line one after another
@@ -66,6 +67,7 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(python tools/benchmark.py maps .*)--parts( '[^']+')+", r"\1--parts"),
 )
 
+FAST = ("README.md", "getting-started.md")  # what a new user reads first; the commands of other pages are slow
 SLOW = (
     r"^erfsfm-slam run(?! --dataset my_drive.mp4 --camera)",  # a whole run each; test_every_command_is_understood
     r"^erfsfm export ",  # tests/erfsfm/test_export.py exports smaller networks
@@ -170,8 +172,10 @@ def shorter(command: str) -> str:
 
 
 def parameter(block: Block) -> Any:
-    slow = [pytest.mark.slow] if any(re.search(pattern, block.text) for pattern in SLOW) else []
-    return pytest.param(block, id=f"{block} {block.text[:50]}", marks=slow)
+    is_slow = block.document.name not in FAST or any(re.search(pattern, block.text) for pattern in SLOW)
+    return pytest.param(
+        block, id=f"{block} {block.text.splitlines()[0][:50]}", marks=[pytest.mark.slow] if is_slow else []
+    )
 
 
 # a command that several pages have runs once, where it stands first
@@ -252,39 +256,21 @@ def raw_drive(root: Path, sequence: Path) -> None:
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All that the documents name, small. Not to be changed: each command works on a copy."""
+    """All that the first pages name, small. Not to be changed: each command works on a copy."""
     here = tmp_path_factory.mktemp("workspace") / "here"
     here.mkdir()
-    size = f"--width {WIDTH} --height {HEIGHT} --route straight"
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(here)
-        call(f"erfsfm-slam simulate world {size} --frames {FRAMES} --seed 700 --depth")
-        call(f"erfsfm-slam simulate scanned {size} --frames {RAW_FRAMES} --seed 701 --lidar")
-        call(f"erfsfm-slam simulate held_out {size} --frames 30 --seed 501")
-        train = "erfsfm train --config tiny --dataset world --set training.steps=2 --output"
-        call(f"{train} runs/toy")
-        call("erfsfm train --config tiny --dataset world --prepare prepared")
-        call(f"{train} runs/table1-dfc --set network.sources=4")
-        call("erfsfm predict world/sequences/sim/image_2 --weights runs/toy --output depth")
-        call("erfsfm export --weights runs/toy --format onnx --output net.onnx")
-        relative_network(Path("relative.onnx"))
+        call(f"erfsfm-slam simulate world {SIZE} --frames {FRAMES} --seed 700 --depth")
         for name in ("KITTI", "KITTI_ODOMETRY", "path/to/kitti"):
             for sequence in ("05", "06", "09"):
                 shutil.copytree("world/sequences/sim", f"{name}/sequences/{sequence}")
                 Path(name, "poses").mkdir(exist_ok=True)
                 shutil.copy("world/poses/sim.txt", f"{name}/poses/{sequence}.txt")
-        shutil.copytree("world", "worlds/600")
-        raw_drive(Path("KITTI_RAW"), Path("scanned/sequences/sim"))
-        Path("my_frames.txt").write_text("2011_09_26_drive_0013 5\n")
         call(f"erfsfm-slam run --dataset KITTI --sequence 09 --frames 0:{FIRST_RUN}")
-        for name, archive in (("network", "chained"), ("optimised", "optimised")):
-            files = f"results/latest/reference.kitti.txt results/latest/trajectory_{name}.kitti.txt"
-            call(f"evo_ape kitti {files} -as --save_results {archive}.zip")
         Path("poses").mkdir()
         rows = Path("KITTI/poses/09.txt").read_text().splitlines(keepends=True)
         Path("poses/09.txt").write_text("".join(rows[:FIRST_RUN]))
-        for name in ("dfvo.txt", "runs/orb_0.txt", "runs/orb_1.txt"):  # of other systems
-            shutil.copy("results/latest/trajectory_network.kitti.txt", name)
         images = sorted(Path("world/sequences/sim/image_2").glob("*.png"))
         for name in ("photos", "images", "drive/images"):
             Path(name).mkdir(parents=True)
@@ -295,6 +281,33 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for image in images:
             video.write(cv2.imread(str(image)))
         video.release()
+    return here
+
+
+@pytest.fixture(scope="module")
+def whole_workspace(workspace: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All that the documents name."""
+    here = tmp_path_factory.mktemp("whole") / "here"
+    copy_of(workspace, here)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(here)
+        call(f"erfsfm-slam simulate scanned {SIZE} --frames {RAW_FRAMES} --seed 701 --lidar")
+        call(f"erfsfm-slam simulate held_out {SIZE} --frames 30 --seed 501")
+        train = "erfsfm train --config tiny --dataset world --set training.steps=2 --output"
+        call(f"{train} runs/toy")
+        call("erfsfm train --config tiny --dataset world --prepare prepared")
+        call(f"{train} runs/table1-dfc --set network.sources=4")
+        call("erfsfm predict world/sequences/sim/image_2 --weights runs/toy --output depth")
+        call("erfsfm export --weights runs/toy --format onnx --output net.onnx")
+        relative_network(Path("relative.onnx"))
+        copy_of(Path("world"), Path("worlds/600"))
+        raw_drive(Path("KITTI_RAW"), Path("scanned/sequences/sim"))
+        Path("my_frames.txt").write_text("2011_09_26_drive_0013 5\n")
+        for name, archive in (("network", "chained"), ("optimised", "optimised")):
+            files = f"results/latest/reference.kitti.txt results/latest/trajectory_{name}.kitti.txt"
+            call(f"evo_ape kitti {files} -as --save_results {archive}.zip")
+        for name in ("dfvo.txt", "runs/orb_0.txt", "runs/orb_1.txt"):  # of other systems
+            shutil.copy("results/latest/trajectory_network.kitti.txt", name)
         fixes = [f"{k / 10},{49 + k * 1e-5},8.4,114" for k in range(FRAMES)]
         Path("track.csv").write_text("\n".join(["stamp,latitude,longitude,altitude", *fixes]))
         for file in ("old", "exp_pose_model_best"):
@@ -306,11 +319,17 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
+def copy_of(folder: Path, copy: Path) -> None:
+    """Of a folder, by links: the system never writes into a file."""
+    shutil.copytree(folder, copy, symlinks=True, copy_function=os.link)
+
+
 @pytest.fixture
-def at_work(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def at_work(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the workspace as the current folder, where ``$KITTI_ODOMETRY`` is its ``KITTI``."""
     here = tmp_path / "here"
-    shutil.copytree(workspace, here, symlinks=True, copy_function=os.link)  # the system never writes into a file
+    is_slow = request.node.get_closest_marker("slow") is not None
+    copy_of(request.getfixturevalue("whole_workspace" if is_slow else "workspace"), here)
     monkeypatch.chdir(here)
     monkeypatch.setenv("KITTI_ODOMETRY", str(here / "KITTI"))
     return here
@@ -405,12 +424,11 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert {"map.ply", "model/points3D.txt", "model/images/000119.png", "run/report.html"} <= written
 
 
-def blocks(*languages: str) -> list[Any]:
-    found = [block for document in DOCUMENTS for block in fenced(document) if block.language in languages]
-    return [pytest.param(block, id=str(block)) for block in found]
+def blocks(*languages: str) -> list[Block]:
+    return [block for document in DOCUMENTS for block in fenced(document) if block.language in languages]
 
 
-@pytest.mark.parametrize("block", blocks("python", "py"))
+@pytest.mark.parametrize("block", [parameter(block) for block in blocks("python", "py")])
 def test_every_python_block_runs(block: Block, at_work: Path) -> None:
     names = stand_ins(at_work / "world")
     code = compile("\n" * (block.line - 1) + block.text, str(block.document), "exec")  # a traceback names the line
@@ -421,7 +439,7 @@ def test_every_python_block_runs(block: Block, at_work: Path) -> None:
         raise
 
 
-@pytest.mark.parametrize("block", blocks("yaml", "yml"))
+@pytest.mark.parametrize("block", blocks("yaml", "yml"), ids=str)
 def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
     camera = yaml.safe_load(block.text)
     assert "fx" in camera, f"{block}: this test reads camera.yaml only; add this kind of YAML"

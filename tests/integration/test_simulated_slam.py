@@ -103,6 +103,7 @@ def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> N
     assert np.percentile(distance, 90) < 2 * 0.20
 
 
+@pytest.mark.slow
 def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> None:
     part = street.cut(40, 70)
     oracle = OraclePredictor(part.reference, part.depth)

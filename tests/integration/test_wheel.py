@@ -93,6 +93,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(sdist, wheel, environment)
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
     names = set(zipfile.ZipFile(installed.wheel).namelist())
     for package in SHIPPED:
@@ -105,6 +106,7 @@ def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
         assert "/".join(parts) in names
 
 
+@pytest.mark.slow
 def test_an_index_takes_both(installed: Installed) -> None:
     assert not twine.commands.check.check([str(installed.sdist), str(installed.wheel)], strict=True)
     with tarfile.open(installed.sdist) as archive:

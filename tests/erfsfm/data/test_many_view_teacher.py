@@ -118,6 +118,7 @@ def test_poses_by_other_weights_are_refused(recording, teacher):
         teacher.prepare([recording], 4, "default", lambda *_: None)
 
 
+@pytest.mark.slow
 def test_a_drive_that_the_slam_system_cannot_follow_is_one_line(recording, tmp_path):
     short = recording.part(0, 3)
     with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:3\] could not be found: .*3 frames"):

@@ -34,6 +34,7 @@ def test_rows_are_those_of_the_paper(tool: dict[str, Any]) -> None:
         tool["paper_rows"](["table9-*"])
 
 
+@pytest.mark.slow
 def test_tables_of_a_small_fake(
     tool: dict[str, Any],
     tmp_path: Path,

@@ -42,11 +42,13 @@ def calls_of(network: nn.Module) -> list[object]:
     return calls
 
 
+SLOW = ("erf-depthnet-dilated", "erf-depthnet-dfcv2", "erf-posenet-dfcv2")
+
+
 @pytest.mark.parametrize(
     "name",
-    [f"{erf}{kind}{variant}" for kind in ("depth", "pose") for erf, variant in (("", "net"), ("erf-", "net-dfcv2"))]
-    + ["erf-posenet-dilated", "erf-depthnet-lite0"]
-    + [pytest.param(name, marks=pytest.mark.slow) for name in ("erf-depthnet-dilated", "erf-posenet-dfc")],
+    ["depthnet", "posenet", "erf-posenet-dilated", "erf-posenet-dfc", "erf-depthnet-lite0"]
+    + [pytest.param(name, marks=pytest.mark.slow) for name in SLOW],
 )
 @torch.inference_mode()
 def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,8 +39,8 @@ def test_theoretical(name, fidelity, wanted):
     [
         ("posenet", "default", 0.0),
         ("erf-posenet-dilated", "default", 0.0),
-        ("erf-posenet-dilated", "paper", 0.0),
-        ("erf-posenet-dfc", "default", 1.0),
+        pytest.param("erf-posenet-dilated", "paper", 0.0, marks=pytest.mark.slow),
+        pytest.param("erf-posenet-dfc", "default", 1.0, marks=pytest.mark.slow),
         pytest.param("erf-posenet-dfcv2", "default", 0.5, marks=pytest.mark.slow),
     ],
 )
@@ -80,7 +80,7 @@ def test_measured(name, fidelity, size, pixel, map_size, box, coverage):
         ("erf-posenet-dfc", 0.5, 415, 0.998),
         ("erf-posenet-dfc", 2.0, 416, 1.0),
         ("erf-posenet-dfcv2", 0.5, 293, 0.704),
-        ("erf-posenet-dfcv2", 2.0, 321, 0.767),
+        pytest.param("erf-posenet-dfcv2", 2.0, 321, 0.767, marks=pytest.mark.slow),
     ],
 )
 def test_measured_with_taps_pushed_outwards(name, offsets_px, columns, coverage):

@@ -274,6 +274,7 @@ class Clock:
         monkeypatch.setattr("lightning.pytorch.callbacks.timer.time", SimpleNamespace(monotonic=lambda: self.now))
 
 
+@pytest.mark.slow
 def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
     small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

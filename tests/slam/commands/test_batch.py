@@ -168,6 +168,7 @@ def dies_once(drive: Drive) -> Outcome:
     return Outcome(drive, path, "whole")
 
 
+@pytest.mark.slow
 def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path) -> None:
     pytest.importorskip("dask.distributed")
     drives = [Drive(str(n), tmp_path, ()) for n in range(4)]

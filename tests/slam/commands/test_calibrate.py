@@ -132,7 +132,11 @@ def require_close(camera: CameraFile, studio: Studio) -> None:
 
 @pytest.mark.parametrize(
     "lens, options",
-    [({}, []), (FISHEYE, ["--model", "fisheye"]), (CHARUCO, ["--pattern", "charuco"])],
+    [
+        ({}, []),
+        (FISHEYE, ["--model", "fisheye"]),
+        pytest.param(CHARUCO, ["--pattern", "charuco"], marks=pytest.mark.slow),
+    ],
     ids=["opencv", "fisheye", "charuco"],
 )
 def test_a_known_camera_is_found(tmp_path: Path, calibrate: Call, lens: dict, options: list[str]) -> None:
@@ -150,6 +154,7 @@ def test_a_known_camera_is_found(tmp_path: Path, calibrate: Call, lens: dict, op
     assert sequence.frame(0).image.shape == (studio.height, studio.width, 3)
 
 
+@pytest.mark.slow
 def test_among_the_images_the_picture_is_none_of_them(tmp_path: Path, calibrate: Call) -> None:
     small = Studio(width=240, height=180, camera=(195.0, 197.0, 124.0, 87.5), distortion=(0.0,) * 5)
     folder = write_views(tmp_path / "board", small, spread(10, 40))

@@ -81,7 +81,9 @@ def save(path: Path, image: Image) -> None:
     cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1]))
 
 
-@pytest.mark.parametrize("hazards", [(), ("rain",)])  # the album has another exposure
+@pytest.mark.parametrize(
+    "hazards", [pytest.param((), marks=pytest.mark.slow), ("rain",)]
+)  # the album has another exposure
 def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
     localiser = Localiser(places())
     found = 0
@@ -109,6 +111,7 @@ def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -
         assert found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
 
 
+@pytest.mark.slow
 def test_another_size_of_the_same_camera_is_found_too() -> None:
     image = street(630).frame(31).image
     twice = np.asarray(cv2.resize(image, (624, 192), interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -128,7 +131,9 @@ def bent(image: Image, camera: CameraFile) -> Image:
     return np.asarray(cv2.remap(image, seen.astype(np.float32), None, cv2.INTER_LINEAR), np.uint8)
 
 
-@pytest.mark.parametrize(("where", "given"), [("images", "images/25.png"), (".", "images"), (None, "")])
+@pytest.mark.parametrize(
+    ("where", "given"), [pytest.param("images", "images/25.png", marks=pytest.mark.slow), (".", "images"), (None, "")]
+)
 def test_images_of_a_lens_need_its_camera_file(run: RunFolder, tmp_path: Path, where: str | None, given: str) -> None:
     """It is looked for where ``run`` looks."""
     run.write(PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write)

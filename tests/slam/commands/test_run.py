@@ -141,6 +141,7 @@ def test_an_unreadable_image_is_bridged_and_reported(
         assert "000006.png is truncated" in (folder.path / name).read_text()
 
 
+@pytest.mark.slow
 def test_unreadable_scans_are_left_out_and_reported(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
 ) -> None:

@@ -93,6 +93,7 @@ def test_density_does_not_weigh() -> None:
     assert found["in_field"]["accuracy_median_m"] == pytest.approx(2.0, abs=CLOSE_M)
 
 
+@pytest.mark.slow
 def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
     points = road(36.0)
     points[np.abs(points[:, 0]) > 9.0, 1] -= 0.35

@@ -16,6 +16,7 @@ from slam.simulation.street import SimulatedStreet
 
 QUALITIES = range(60, 90, 3)
 STREET = 24  # frames
+HAZARDS = [(), ("exposure", "blur"), pytest.param(("rain", "moving-cars"), marks=pytest.mark.slow)]
 
 
 @functools.cache
@@ -58,7 +59,7 @@ def panned(positions_px: np.ndarray) -> list[Image]:
     return [cv2.warpAffine(wide(), shift, (208, 64), flags=cv2.INTER_LINEAR) for shift in shifts]
 
 
-@pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
+@pytest.mark.parametrize("hazards", HAZARDS)
 def test_a_drive_passes(hazards: tuple[str, ...]) -> None:
     assert set(verdicts(street(hazards))) == {"new"}
 
@@ -90,7 +91,7 @@ def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
     assert verdicts([second, almost]) == ["new", "new"]  # the camera has not moved yet
 
 
-@pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
+@pytest.mark.parametrize("hazards", HAZARDS)
 @pytest.mark.parametrize("first", [3, 9])
 def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(hazards: tuple[str, ...], first: int) -> None:
     images = street(hazards)

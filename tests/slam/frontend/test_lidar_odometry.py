@@ -90,6 +90,7 @@ def test_without_two_scans_that_can_be_read_the_reason_stands_for_the_path(stree
     assert re.search(r"2 of 2 LiDAR scans .*0\.bin is no Velodyne scan.*; got [45] bytes", failure.reason)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_drive_0013_is_as_long_as_its_oxts_path(data_root):
     sequence = open_sequence(data_root / "kitti_raw", frames="0:25")

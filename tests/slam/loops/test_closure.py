@@ -108,6 +108,7 @@ def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
     assert metric == ends(0.05) == ends(20.0)
 
 
+@pytest.mark.slow
 def test_a_car_that_waits_at_a_place_has_one_loop_there() -> None:
     """It stands where a loop ends, for 20 views of the same image, whose loops say the same again and again."""
     sequence, result = closed(610)

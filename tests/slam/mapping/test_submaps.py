@@ -3,6 +3,7 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 
 from slam.mapping import surface
 from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS
@@ -23,6 +24,7 @@ def test_submaps_merge_to_the_surface_of_one(street_map, monkeypatch):
     assert np.median(distance) < 0.01
 
 
+@pytest.mark.slow
 def test_little_memory_ends_a_submap_early_and_leaves_nothing_out(street_map):
     statistics = street_map(memory_mb=100, voxel_size_m=0.06).statistics()
     assert statistics["submaps"] > 1 and statistics["frames_fused"] == 18

@@ -62,6 +62,7 @@ def errors(found: KeyframePoses, truth: FloatArray) -> tuple[float, float]:
     return float(np.sqrt((distance**2).mean())), float(np.rad2deg(turned).max())
 
 
+@pytest.mark.slow
 def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_closer() -> None:
     truth, state = lost_on_the_way()
     assert sum(segment.started for segment in state.segments) == 2
@@ -131,7 +132,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
 @pytest.mark.parametrize(
     ("places", "unseen", "sparse", "relocalised"),
     [
-        ([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 67]),
+        pytest.param([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 67], marks=pytest.mark.slow),
         pytest.param([*range(61), 68, 60, 8], (60, 62), (61,), [63], marks=pytest.mark.slow),
         ([*range(70), 40, 41], range(60, 70), (), []),
     ],

@@ -137,7 +137,16 @@ def ate(result: Estimate) -> float:
     return float(trajectory_metrics(result.optimised, result.reference).align.dof7.ate_rmse_m)
 
 
-@pytest.mark.parametrize("damage", [black, repeated_as_jpeg, missing, unreadable], ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize(
+    "damage",
+    [
+        black,
+        pytest.param(repeated_as_jpeg, marks=pytest.mark.slow),
+        pytest.param(missing, marks=pytest.mark.slow),
+        unreadable,
+    ],
+    ids=lambda damage: damage.__name__,
+)
 def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
     result, warnings = run_on(damage)
     for each in (result.network, result.odometry, result.optimised):

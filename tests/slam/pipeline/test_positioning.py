@@ -105,7 +105,7 @@ def test_a_track_that_does_not_fit_is_refused() -> None:
         run(None, "scale.mode=gps")
 
 
-@pytest.mark.parametrize("change", ["backwards", "late"])
+@pytest.mark.parametrize("change", ["backwards", pytest.param("late", marks=pytest.mark.slow)])
 def test_fixes_of_another_drive_are_left_out_or_refused(change: str, caplog: pytest.LogCaptureFixture) -> None:
     gps = track(np.random.default_rng(0), 0.0)
     places = gps.places[::-1] if change == "backwards" else np.roll(gps.places, 30, axis=0)

@@ -336,6 +336,7 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
 
 
+@pytest.mark.slow
 def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: SimulatedSequence) -> None:
     """In camera heights, which are no metres; depth of the sky is unknown."""
     result = drive_street(street, mode="none", sky=np.nan)

@@ -30,7 +30,11 @@ assert import_open3d().visualization.draw_plotly
 """
 
 
-@pytest.mark.parametrize("code", [WINDOWS, IN_NOTEBOOK], ids=["windows at their first use", "whole in a notebook"])
+@pytest.mark.parametrize(
+    "code",
+    [WINDOWS, pytest.param(IN_NOTEBOOK, marks=pytest.mark.slow)],
+    ids=["windows at their first use", "whole in a notebook"],
+)
 def test_open3d_is_imported(code: str) -> None:
     finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr

@@ -226,6 +226,7 @@ def test_a_camera_keeps_its_field_of_view_when_its_image_is_shrunk() -> None:
     assert K[1, 1] / K[0, 0] == pytest.approx(one.aspect * 128 / 416)
 
 
+@pytest.mark.slow
 def test_sunny_streets_saturate_a_little_and_shadows_are_deep() -> None:
     shares, steepest = [], 0.0
     for seed in range(700, 706):

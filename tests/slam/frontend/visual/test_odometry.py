@@ -144,7 +144,7 @@ def behind_block(frame: Frame, left: int, ratio: tuple[float, float] = (0.6, 0.8
     return Frame(frame.index, frame.stamp, image)
 
 
-@pytest.mark.parametrize("forward", [0.0, 0.8])
+@pytest.mark.parametrize("forward", [pytest.param(0.0, marks=pytest.mark.slow), 0.8])
 def test_what_passes_before_the_camera_is_not_the_world(texture, forward):
     """It covers half of the image and has most of the corners there."""
     T_previous_current = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, forward]))
@@ -297,7 +297,7 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(texture, turn_d
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "first", "last", "block", "largest_deg"),
-    [("05", 90, 115, False, 0.5), ("00", 100, 145, True, 1.5)],
+    [("05", 90, 115, False, 0.5), pytest.param("00", 100, 145, True, 1.5, marks=pytest.mark.slow)],
 )
 def test_rotation_on_real_frames(data_root, name, first, last, block, largest_deg):
     folder = data_root / "kitti_odometry" / "sequences" / name

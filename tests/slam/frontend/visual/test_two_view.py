@@ -133,6 +133,7 @@ def test_without_common_points_there_is_no_motion():
     assert estimate(matches, NO_HISTORY) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [264])
 def test_a_car_that_turns_off_in_rain_does_not_turn_the_camera(first):
     """Its corners are most of what blur and rain leave: an essential matrix by these is wrong by 4 degrees a frame."""

@@ -133,6 +133,7 @@ def test_networks_json(run: Run) -> None:
     assert "paper fidelity" in reasons[0]
 
 
+@pytest.mark.slow
 def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
     images = write_root(tmp_path / "root", frames=6) / "sequences/00/image_2"
     picture = tmp_path / "new/field.png"

@@ -12,6 +12,7 @@ def by_name(names, **options):
     }
 
 
+@pytest.mark.slow
 def test_the_papers_dilated_network_follows_ours():
     rows = by_name(["posenet", "erf-posenet-dilated"])
     assert list(rows) == [("posenet", "default"), ("erf-posenet-dilated", "default"), ("erf-posenet-dilated", "paper")]

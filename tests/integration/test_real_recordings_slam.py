@@ -29,6 +29,7 @@ def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Calla
     assert metrics["map"]["accuracy_median_m"] is None and (metrics["map"]["triangles"] or 0) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_drive_at_full_size(data_root: Path, tmp_path: Path) -> None:
     root = data_root / "kitti_odometry_original"

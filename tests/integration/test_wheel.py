@@ -18,6 +18,7 @@ import hatchling.build
 import pytest
 import twine.commands.check
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ("erfsfm", "slam")
 NO_NETWORK = """
@@ -93,7 +94,6 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(sdist, wheel, environment)
 
 
-@pytest.mark.slow
 def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
     names = set(zipfile.ZipFile(installed.wheel).namelist())
     for package in SHIPPED:
@@ -106,7 +106,6 @@ def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
         assert "/".join(parts) in names
 
 
-@pytest.mark.slow
 def test_an_index_takes_both(installed: Installed) -> None:
     assert not twine.commands.check.check([str(installed.sdist), str(installed.wheel)], strict=True)
     with tarfile.open(installed.sdist) as archive:
@@ -119,14 +118,12 @@ def test_the_programs_are_those_of_the_wheel(installed: Installed, tmp_path: Pat
     assert all(Path(file).is_relative_to(installed.environment) for file in where.split())
 
 
-@pytest.mark.slow
 def test_it_runs(installed: Installed, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
     installed.run(tmp_path, "erfsfm-slam", "run", "--frames", "0:40")
     metrics = check_run(tmp_path / "results" / "latest")
     assert metrics["sequence"]["frames"] == 40 and metrics["map"]["triangles"] > 1000
 
 
-@pytest.mark.slow
 def test_it_trains_by_name(installed: Installed, tmp_path: Path) -> None:
     assert {row["name"] for row in json.loads(installed.run(tmp_path, "erfsfm", "networks", "--json"))} >= {"depthnet"}
     size = ("--route", "straight", "--frames", 12, "--width", 208, "--height", 64)

@@ -94,7 +94,7 @@ def test_both_dumps_read_back() -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "[" * 3_000,
+        pytest.param("[" * 3_000, marks=pytest.mark.slow, id="deep"),
         "a: 1\nb: 2\n'a': 3",
         "? [a]\n: 1",
         "x: 2011-99-99",

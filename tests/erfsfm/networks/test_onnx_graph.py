@@ -42,12 +42,12 @@ def calls_of(network: nn.Module) -> list[object]:
     return calls
 
 
-SLOW = ("erf-depthnet-dilated", "erf-depthnet-dfcv2", "erf-posenet-dfcv2")
+SLOW = ("erf-depthnet-dilated", "erf-depthnet-dfcv2", "erf-posenet-dfc", "erf-posenet-dfcv2")
 
 
 @pytest.mark.parametrize(
     "name",
-    ["depthnet", "posenet", "erf-posenet-dilated", "erf-posenet-dfc", "erf-depthnet-lite0"]
+    ["depthnet", "posenet", "erf-posenet-dilated", "erf-depthnet-lite0"]
     + [pytest.param(name, marks=pytest.mark.slow) for name in SLOW],
 )
 @torch.inference_mode()

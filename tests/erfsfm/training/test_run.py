@@ -185,6 +185,7 @@ def test_resume_ends_with_identical_weights(
     assert (tmp_path / "cut" / "logs" / "csv_from_4" / "metrics.csv").is_file()
 
 
+@pytest.mark.slow
 def test_the_average_of_the_weights_is_what_is_measured_and_written(
     both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

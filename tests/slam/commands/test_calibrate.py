@@ -134,7 +134,7 @@ def require_close(camera: CameraFile, studio: Studio) -> None:
     "lens, options",
     [
         ({}, []),
-        (FISHEYE, ["--model", "fisheye"]),
+        pytest.param(FISHEYE, ["--model", "fisheye"], marks=pytest.mark.slow),
         pytest.param(CHARUCO, ["--pattern", "charuco"], marks=pytest.mark.slow),
     ],
     ids=["opencv", "fisheye", "charuco"],

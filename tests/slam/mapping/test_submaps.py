@@ -30,6 +30,7 @@ def test_little_memory_ends_a_submap_early_and_leaves_nothing_out(street_map):
     assert statistics["submaps"] > 1 and statistics["frames_fused"] == 18
 
 
+@pytest.mark.slow
 def test_tiles_are_joined_without_a_seam(street_map, monkeypatch):
     """The road crosses the border of tiles at x = 0; with voxels of 0.1 m another one lies at z = 25.6."""
     # a wall without noise that was seen once lies on voxels exactly, whose vertices coincide

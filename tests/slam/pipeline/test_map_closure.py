@@ -134,7 +134,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     [
         pytest.param([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 67], marks=pytest.mark.slow),
         pytest.param([*range(61), 68, 60, 8], (60, 62), (61,), [63], marks=pytest.mark.slow),
-        ([*range(70), 40, 41], range(60, 70), (), []),
+        pytest.param([*range(70), 40, 41], range(60, 70), (), [], marks=pytest.mark.slow),
     ],
     ids=["relocalised before", "located in a frame without depth before", "in a map that has just begun"],
 )

@@ -189,6 +189,7 @@ def rolling_exposure(sequence: SimulatedSequence, index: int) -> Frame:
     return replace(frame, image=image)
 
 
+@pytest.mark.slow
 def test_rolling_exposure_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     run(rolling_exposure, range(FRAMES), "mapping.enabled=false")
     assert "the exposure rolls: " in caplog.text

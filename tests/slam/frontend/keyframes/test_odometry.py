@@ -69,6 +69,7 @@ def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
     assert stood.max() < 0.005 * travelled
 
 
+@pytest.mark.slow
 def test_another_scene_begins_another_map() -> None:
     walked = room.walk(60)
     state = room.tracked(walked, [0] * 25 + [7] * 35)

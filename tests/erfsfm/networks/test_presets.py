@@ -55,6 +55,7 @@ def test_width_scales_hidden_channels_and_not_the_heads():
     assert pose.pose_head.weight.shape == (18, 64, 1, 1)
 
 
+@pytest.mark.slow
 def test_descriptions():
     """Of the default fidelity; tests/erfsfm/test_cli.py has the paper's."""
     summaries = {summary["name"]: summary for summary in describe()}

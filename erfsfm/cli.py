@@ -62,7 +62,7 @@ def train(
 
     Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
     """
-    from erfsfm.config import load_experiment
+    from erfsfm.config import UNTRAINED, load_experiment
     from erfsfm.training.run import depth_before_and_after
     from erfsfm.training.run import prepare as prepare_training
     from erfsfm.training.run import train as run_training
@@ -79,7 +79,7 @@ def train(
         folder = run_training(experiment, output, resume, device, _command(), progress)
         typer.echo(f"weights in {folder}: use them with --weights {folder}")
         typer.echo(_how_good(folder))
-        if experiment.initial_weights is None or experiment.data.validation_share == 0:
+        if experiment.initial_weights in UNTRAINED or experiment.data.validation_share == 0:
             return
         try:
             rows = depth_before_and_after(experiment, folder, device, progress)

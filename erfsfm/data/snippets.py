@@ -25,6 +25,8 @@ from erfsfm.data.split import usable
 from erfsfm.data.window import Snippet, TeacherStructure, first_readable, load_window, readable, snippet_motion
 from erfsfm.geometry.camera import Camera
 
+_VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
+
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     """Random snippets number ``first_draw`` to ``draws``; whole batches are distributed to processes and workers."""
@@ -138,7 +140,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         length = config.network.sources + 1
         kept = usable(recordings, length)
         windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
-        chosen = np.linspace(0, len(windows) - 1, min(config.data.validation_snippets, len(windows)))
+        chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
         self.snippets = readable([windows[int(i)] for i in chosen.round()], self._read)
 
     def __len__(self) -> int:

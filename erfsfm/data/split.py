@@ -18,7 +18,7 @@ from pydantic import Field
 from erfsfm.common.config_tree import Section, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
-from erfsfm.config import DataConfig, config_folders
+from erfsfm.config import EIGEN, DataConfig, config_folders
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
 from erfsfm.data.standstill import moving_parts
@@ -88,12 +88,12 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     split = read_split_file(config.split) if config.split else Split()
-    left_out = read_split_file(config.leave_out).test_recordings if config.leave_out != "none" else []
-    scenes = [FrameRange.parse(name) for name in left_out]
+    scenes = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
     ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
     listed = [FrameRange.parse(name) for name in split.train]
     held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
-    never = [FrameRange.parse(name) for name in (*config.exclude, *split.test_recordings)]
+    excluded = [name for name in config.exclude if name != EIGEN]
+    never = [FrameRange.parse(name) for name in (*excluded, *split.test_recordings)]
     unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
     if unknown:
         raise DataError(f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}")
@@ -106,7 +106,8 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     validation: list[Recording] = []
     for recording in found:
         validation += _parts(recording, held_out)
-        forbidden = [*held_out, *never, *(scenes if recording.name.startswith("kitti_raw/") else [])]
+        eigens = map(FrameRange.parse, scenes if recording.name.startswith("kitti_raw/") else ())
+        forbidden = [*held_out, *never, *eigens]
         chosen = next((each for each in (ranges, listed) if _spans(recording, each)), None)  # ranges before a list
         whole = [] if listed else [recording]
         for part in whole if chosen is None else _parts(recording, chosen):
@@ -114,7 +115,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not training:
         raise DataError(
             f"nothing left to train on: every recording found ({_names(found)}) is excluded or used to validate or "
-            "test; see data.exclude, data.validation, data.split and data.leave_out"
+            "test; see data.exclude, data.validation and data.split"
         )
     if config.validation_share > 0:
         training, ends = _ends_split_off(training, config.validation_share)
@@ -129,7 +130,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
     if absent:
         logger.warning("data.validation names %s, which is not among the data", _some(absent))
-    return _without_stops(training, config), _without_stops(validation, config)
+    return _without_stops(training), _without_stops(validation)
 
 
 def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
@@ -191,16 +192,14 @@ def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> 
             raise DataError(f"{frames} begins after the {end} frames that the recording has")
 
 
-def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
+def _without_stops(recordings: list[Recording]) -> list[Recording]:
     """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
-    if config.static_frames == "keep":
-        return recordings
     kept = [part for recording in recordings for part in _moving(recording)]
     before = sum(map(len, recordings))
     if (lost := before - sum(map(len, kept))) > 0:
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)
     if recordings and not kept:
-        raise DataError("the camera stands still in every frame found: data.static_frames=keep trains on them")
+        raise DataError("the camera stands still in every frame found: nothing can be learned from them")
     return kept
 
 

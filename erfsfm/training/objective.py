@@ -128,8 +128,8 @@ def _evaluate(
         T_warp[..., :3, 3] /= HEIGHTS
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     snippets = batch.snippets()
-    for level in range(loss.scales if disparities and len(snippets.target) > 0 else 0):
-        scale = Level.of(snippets, disparities[level][-len(snippets.target) :], config)
+    for level, disparity in enumerate(disparities if len(snippets.target) > 0 else ()):
+        scale = Level.of(snippets, disparity[-len(snippets.target) :], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
             photometric = photometric + scale.photometric(T_warp, loss)
@@ -152,7 +152,7 @@ def _teacher_terms(
     terms: dict[str, Tensor] = {}
     if disparities:
         height, width = bounds.least.shape[-2:]
-        levels = [enlarged(disparities[k], k, (height, width)) for k in range(config.loss.scales)]
+        levels = [enlarged(disparity, k, (height, width)) for k, disparity in enumerate(disparities)]
         terms["structure"] = torch.stack([disagreement(level, bounds, math.log(HEIGHTS)) for level in levels]).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)
@@ -201,26 +201,16 @@ class Level:
     def photometric(self, T_source_target: Tensor, loss: LossConfig) -> Tensor:
         """Their mean over pixels, reduced over sources as the loss wants it."""
         error, valid = self.errors(T_source_target, loss.ssim_weight)
-        count = self.sources.shape[1]
-        still: Tensor | None = None
-        if loss.auto_mask:
-            with torch.no_grad():
-                before, after = self.sources[:, count // 2 - 1], self.sources[:, count // 2]
-                still = torch.minimum(
-                    photometric_error(self.target, before, loss.ssim_weight),
-                    photometric_error(self.target, after, loss.ssim_weight),
-                )[:, 0]  # (B, h, w)
         if loss.reduction == "mean":
             # pixels without a source count as zero and sources are summed, as in the paper's code
-            summed = (error * valid).sum(dim=1)
-            if still is None:
-                return summed.mean()
-            moving = (summed / valid.sum(1).clamp(min=1) < still) & valid.any(dim=1)
-            return (summed * moving).mean()
+            return (error * valid).sum(dim=1).mean()
         best = error.masked_fill(~valid, torch.inf).amin(dim=1)  # (B, h, w)
-        counted = valid.any(dim=1)
-        if still is not None:
-            counted = counted & (best.detach() < still)
+        middle = self.sources.shape[1] // 2
+        with torch.no_grad():
+            before, after = self.sources[:, middle - 1], self.sources[:, middle]
+            unwarped = [photometric_error(self.target, image, loss.ssim_weight) for image in (before, after)]
+            still = torch.minimum(*unwarped)[:, 0]  # (B, h, w)
+        counted = valid.any(dim=1) & (best.detach() < still)
         return best.masked_fill(~counted, 0).sum() / counted.sum().clamp(min=1)
 
     def smoothness(self, loss: LossConfig) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from erfsfm.checkpoint import read_torch
+from erfsfm.common.config_tree import read_yaml
 from erfsfm.common.errors import ConfigError, TrainingError
 from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
@@ -55,11 +56,11 @@ class OutputFolder:
             if not needed.is_file():
                 raise TrainingError(f"nothing to resume in {self.path}: no {needed.name}; start without --resume")
         steps = _steps_of(self.checkpoint)
-        begun = load_experiment(written)
-        if begun.network != config.network:
+        begun, wanted = read_yaml(written), config.model_dump(mode="json")  # begun with settings of another version
+        if begun["network"] != wanted["network"]:
             raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
         for key in ("networks", "frozen_stages"):
-            before, now = getattr(begun.training, key), getattr(config.training, key)
+            before, now = begun["training"][key], wanted["training"][key]
             if before != now:
                 raise ConfigError(f"{written} began with training.{key} {before}; got {now}: resume with the same")
         return steps

@@ -31,7 +31,7 @@ from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import opencv_threads
-from erfsfm.config import ExperimentConfig, Precision
+from erfsfm.config import UNTRAINED, ExperimentConfig, Precision
 from erfsfm.data.exact_depth import stacked
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
@@ -47,6 +47,7 @@ from erfsfm.training.supervision import imitated, measured_views, seen_by_imitat
 
 logger = logging.getLogger(__name__)
 
+_LOGGED_EVERY = 50  # steps: a hundredth of the shortest useful training; a shorter one is logged at its end
 _LEFT_OUT = ("method", "leak")  # the same in all rows
 
 
@@ -148,7 +149,7 @@ def depth_before_and_after(
     """
     _, validation = split_recordings(config.data)
     cache, rows = config.teacher.cache or output / MEASUREMENTS, []
-    for when, weights in (("before", str(config.initial_weights)), ("after", str(output))):
+    for when, weights in (("before", config.initial_weights), ("after", str(output))):
         networks = DepthPosePredictor.from_weights(weights, device)
         errors = many_view_errors(networks, validation, cache, True, progress)
         rows += [{"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT} for row in errors]
@@ -209,7 +210,7 @@ def _fit(
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
     """Load initial weights, also of another variant; returns what they were trained on."""
     name, wanted = config.initial_weights, config.network
-    model = load_model(name) if name else None
+    model = None if name in UNTRAINED else load_model(name)
     loaded = {} if model is None else model.networks
     if config.training.networks == "depth" and "pose" not in loaded and needs_poses(config):
         raise ConfigError(
@@ -217,7 +218,7 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
             "is none: name weights that have one as initial_weights, or set teacher.views=many, or "
             "loss.photometric_weight=0"
         )
-    if config.pretrained == "imagenet" and "depth" not in loaded:
+    if name != "none" and "depth" not in loaded:
         module.take_imagenet()
     if model is None:
         return []
@@ -272,7 +273,7 @@ def _trainer(
         check_val_every_n_epoch=None,
         val_check_interval=training.validate_every if callbacks[0].validates else None,
         num_sanity_val_steps=0,
-        log_every_n_steps=training.log_every,
+        log_every_n_steps=min(_LOGGED_EVERY, training.steps),
         logger=logs,
         callbacks=[latest, *callbacks, *average],
         plugins=[AtomicCheckpoints()],

@@ -169,7 +169,7 @@ def small() -> dict[str, dict[str, object]]:
     return {
         "network": {"depth_width": 0.0625, "pose_width": 0.125, "sources": 2, "height": 32, "width": 64},
         "data": {"workers": 0, "validation": [], "cache_mb": 50},
-        "training": {"steps": 4, "batch": 2, "checkpoint_every": 2, "log_every": 1, "validate_every": 2},
+        "training": {"steps": 4, "batch": 2, "checkpoint_every": 2, "validate_every": 2},
     }
 
 

@@ -34,7 +34,7 @@ def roots(tmp_path: Path, write_root: Callable[..., Path]) -> list[Path]:
 @pytest.fixture
 def config(small: Small, roots: list[Path], measure: Callable[..., None], tmp_path: Path) -> ExperimentConfig:
     """Of a training by many views, measured already."""
-    data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3, "exclude": []}
+    data = {"roots": roots, "validation": ["simulated/500"], "exclude": []}
     teacher = {"views": "many", "stride": STRIDE, "structure_weight": 1.0, "translation_weight": 1.0}
     tree = small | {
         "data": small["data"] | data | {"ranges": {"kitti_odometry/00": "2:11"}, "flip": 0.0, "zoom": 1.0},

@@ -55,7 +55,7 @@ def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small:
     """It holds smaller images than depth maps, and depth of the middle of each snippet alone."""
     roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
     roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
-    data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3}
+    data = {"roots": roots, "validation": ["simulated/500"]}
     prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
     networks, _ = depth_protocol({"networks": Oracle(STEP)}, [tmp_path / "prepared"], allow_leak=False)
     assert networks["images"] == 3

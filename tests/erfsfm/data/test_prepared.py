@@ -85,7 +85,7 @@ def test_validation_is_on_the_same_snippets_with_their_truth(config: ExperimentC
     _, held_out = split_recordings(config.data)
     _, copied = split_recordings(changed(config, roots=[tmp_path / "prepared"]).data)
     original, again = ValidationSnippets(held_out, config), ValidationSnippets(copied, config)
-    assert len(original) == len(again) == 3
+    assert len(original) == len(again) == 7
     for one, other in zip(original, again):
         assert one.keys() == other.keys() >= {"depth", "T_source_target"}
         torch.testing.assert_close(other["T_source_target"], one["T_source_target"])

@@ -58,7 +58,7 @@ def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small:
     data = {"roots": roots, "validation": ["simulated/500"]}
     prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
     networks, _ = depth_protocol({"networks": Oracle(STEP)}, [tmp_path / "prepared"], allow_leak=False)
-    assert networks["images"] == 3
+    assert networks["images"] == 9
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
 
 

@@ -23,15 +23,15 @@ PLACES = [(-0.3, 0.05, -0.4), (0.2, -0.1, 0.35)]  # of the two sources; the targ
 class FixedDepth(nn.Module):
     """One disparity everywhere, whatever the image."""
 
-    def __init__(self, disparity: float) -> None:
+    def __init__(self, disparity: float, levels: int = 4) -> None:
         super().__init__()
+        self.levels = levels
         self.disparity = nn.Parameter(torch.tensor(disparity, dtype=torch.float64))
 
     def forward(self, image: Tensor) -> list[Tensor]:
         height, width = image.shape[-2:]
-        return [
-            self.disparity.expand(len(image), 1, math.ceil(height / 2**s), math.ceil(width / 2**s)) for s in range(4)
-        ]
+        sizes = [(math.ceil(height / 2**s), math.ceil(width / 2**s)) for s in range(self.levels)]
+        return [self.disparity.expand(len(image), 1, *size) for size in sizes]
 
 
 class FixedPose(nn.Module):
@@ -67,8 +67,10 @@ def batch(plane) -> SnippetBatch:
     return SnippetBatch(target, sources, torch.from_numpy(plane.camera.K)[None].double().expand(2, 3, 3))
 
 
-def evaluate(batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor) -> ObjectiveResult:
-    depth_net, pose_net = FixedDepth(disparity).requires_grad_(False), FixedPose(vectors).requires_grad_(False)
+def evaluate(
+    batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor, levels: int = 4
+) -> ObjectiveResult:
+    depth_net, pose_net = FixedDepth(disparity, levels).requires_grad_(False), FixedPose(vectors).requires_grad_(False)
     return evaluate_objective(depth_net, pose_net, batch, config)
 
 
@@ -78,16 +80,16 @@ def test_the_true_depth_and_motion_have_the_least_loss(
     batch: SnippetBatch, plane, reduction: str, ssim_weight: float
 ) -> None:
     config = experiment(reduction=reduction, ssim_weight=ssim_weight)
-    truth = float(evaluate(batch, config, 1 / plane.distance, true_poses()).total)
+    truth = float(evaluate(batch, config, 1 / plane.distance, true_poses(), 2).total)
     assert 0 <= truth < 0.02
     turned = true_poses()
     turned[:, 4] = 0.05
     wrong = {
-        "too near": evaluate(batch, config, 1.4 / plane.distance, true_poses()),
-        "too far": evaluate(batch, config, 0.6 / plane.distance, true_poses()),
-        "backwards": evaluate(batch, config, 1 / plane.distance, -true_poses()),
-        "turned": evaluate(batch, config, 1 / plane.distance, turned),
-        "swapped": evaluate(batch, config, 1 / plane.distance, true_poses().flip(0)),
+        "too near": evaluate(batch, config, 1.4 / plane.distance, true_poses(), 2),
+        "too far": evaluate(batch, config, 0.6 / plane.distance, true_poses(), 2),
+        "backwards": evaluate(batch, config, 1 / plane.distance, -true_poses(), 2),
+        "turned": evaluate(batch, config, 1 / plane.distance, turned, 2),
+        "swapped": evaluate(batch, config, 1 / plane.distance, true_poses().flip(0), 2),
     }
     for name, outcome in wrong.items():
         assert float(outcome.total) > 2 * truth, name

@@ -172,8 +172,7 @@ def evaluate_depth(
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
     from erfsfm.evaluation.eigen import eigen_protocol
-    from erfsfm.evaluation.many_view_truth import many_view_protocol
-    from erfsfm.evaluation.protocols import depth_protocol
+    from erfsfm.evaluation.protocols import depth_protocol, many_view_protocol
     from erfsfm.inference import DepthPosePredictor
 
     if truth == "many-views" and split is not None:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ExportError
 from erfsfm.common.files import refuse_foreign, write_atomically
-from erfsfm.common.threads import open_session
+from erfsfm.common.processes import open_session
 from erfsfm.config import NetworkKind
 from erfsfm.networks.torch_network import exported
 

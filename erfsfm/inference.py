@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.errors import CheckpointError, ConfigError
+from erfsfm.common.processes import usable_cores
+from erfsfm.common.readers.camera_file import MOST_PIXELS
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.common.readers.images import resize_image
-from erfsfm.common.readers.pinhole import MOST_PIXELS
-from erfsfm.common.threads import usable_cores
 from erfsfm.config import NetworkKind
 from erfsfm.model_record import ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise

@@ -29,7 +29,7 @@ from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_number
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos, video_name
 from erfsfm.data.prepared import INDEX_FILE, read_prepared
 from erfsfm.data.recordings import Recording, Video, split_at_gaps
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 INDOOR_HEIGHT_M = 0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
 _COLOUR = (2, 3)

@@ -7,6 +7,8 @@ prepared folder a label is a small picture: bounds are rounded by a third of a s
 from __future__ import annotations
 
 import hashlib
+import json
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import as_completed
@@ -16,20 +18,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
 from erfsfm.common.files import FolderLock, write_array, write_atomically
-from erfsfm.common.processes import processes
+from erfsfm.common.processes import limit_library_threads, processes, slam_process
 from erfsfm.common.progress import Progress
+from erfsfm.common.readers.camera_file import Pinhole
 from erfsfm.common.readers.video import VideoFrames
-from erfsfm.common.threads import limit_library_threads
-from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
-from erfsfm.data.window import TeacherStructure, snippet_motion
-from erfsfm.geometry.camera import Camera
-from erfsfm.labels.drive_poses import drive_poses
-from erfsfm.labels.many_views import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
+from erfsfm.data.window import ArrayCache, TeacherStructure, snippet_motion
+from erfsfm.geometry import Camera
+from erfsfm.labels import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
 from erfsfm.mvs.flow import Grey, measure
 from erfsfm.mvs.views import neighbours_around
 
@@ -338,3 +339,48 @@ def _continued(code: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.
     """Unknown pixels with the code of the known pixel left of them: small when compressed."""
     columns = np.where(known, np.arange(code.shape[1]), 0)
     return np.asarray(np.take_along_axis(code, np.maximum.accumulate(columns, axis=1), axis=1))
+
+
+FPS = 10.0
+CAMERA_HEIGHT_M = 1.65  # any: poses are given in camera heights
+TRAJECTORY = "trajectory_optimised.kitti.txt"
+SETTINGS = ("mapping.enabled=false", "output.report=false")
+
+
+def drive_poses(
+    name: str, images: Iterable[Path | NDArray[np.uint8]], camera: Pinhole, weights: str
+) -> NDArray[np.float64]:
+    """Run the SLAM system on a drive; ``TrainingError`` where it gives no trajectory or no scale.
+
+    Args:
+        name: of the drive, for errors.
+        images: of every frame, files or RGB ``(H, W, 3)``.
+        camera: of the images.
+        weights: of the networks that the system uses.
+
+    Returns:
+        ``T_world_camera`` ``(N, 4, 4)``, translations in heights of the camera over the road.
+    """
+    with tempfile.TemporaryDirectory(prefix="erfsfm-teacher-") as temporary:
+        drive, output = Path(temporary) / "drive", Path(temporary) / "run"
+        drive.mkdir()
+        for index, image in enumerate(images):
+            place = drive / f"{index:06d}.png"
+            if isinstance(image, Path):
+                place.with_suffix(image.suffix).symlink_to(image.resolve())
+            else:
+                cv2.imwrite(str(place), image[..., ::-1])
+        numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        (drive / "camera.yaml").write_text(yaml.safe_dump(numbers | {"fps": FPS, "camera_height_m": CAMERA_HEIGHT_M}))
+        words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights, "--device", "cpu"]
+        reason = slam_process([*words, *(word for setting in SETTINGS for word in ("--set", setting))])
+        if reason or not (output / TRAJECTORY).is_file():
+            raise TrainingError(f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}")
+        rows = np.loadtxt(output / TRAJECTORY).reshape(-1, 3, 4)
+        mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
+    if mode != "camera-height":
+        raise TrainingError(f"the teacher's poses of {name} have no scale: no road was found (scale mode {mode})")
+    T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_world_camera[:, :3] = rows
+    T_world_camera[:, :3, 3] /= CAMERA_HEIGHT_M
+    return T_world_camera

@@ -26,7 +26,7 @@ from erfsfm.config import NetworkConfig
 from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher, encode
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import Snippet
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 INDEX_FILE = "prepared.yaml"
 _POSES, _LABELS = "poses.txt", "labels"  # of a recording: true poses of its camera (KITTI), and the teacher's

@@ -20,7 +20,7 @@ from erfsfm.common.readers.images import Image, read_depth_map, read_image, resi
 from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import Fidelity
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 logger = logging.getLogger(__name__)
 

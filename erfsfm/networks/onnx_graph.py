@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession
 
 from erfsfm.common.files import read_bytes, write_atomically
-from erfsfm.common.threads import open_session
+from erfsfm.common.processes import open_session
 
 if TYPE_CHECKING:
     from torch import nn
@@ -131,6 +131,6 @@ def _path(made_from: str) -> Path:
 def _code() -> str:
     """Digest of the files from which graphs are made: networks and their geometry."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
-    for file in sorted([*package.glob("networks/*.py"), *package.glob("geometry/*.py")]):
+    for file in sorted([*package.glob("networks/*.py"), package / "geometry.py"]):
         digest.update(file.read_bytes())
     return digest.hexdigest()

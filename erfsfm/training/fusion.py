@@ -23,8 +23,8 @@ from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.data.augmentation import weathered
 from erfsfm.data.discovery import discover
-from erfsfm.data.exact_depth import FARTHEST_M
 from erfsfm.data.recordings import Recording
+from erfsfm.data.snippets import FARTHEST_M
 from erfsfm.inference import DepthPosePredictor, depth_at, has_bfloat16
 from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP, evidence
 from erfsfm.mvs.refine import measure

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from erfsfm.checkpoint import build_networks
 from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig, NetworkKind, TrainedNetworks
-from erfsfm.data.samples import in_unit_range
+from erfsfm.data.augmentation import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
-from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.losses.structure import Bounds
+from erfsfm.geometry import pose_vector_to_matrix
+from erfsfm.losses import Bounds
 from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0DepthNet

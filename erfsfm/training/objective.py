@@ -12,14 +12,15 @@ from torch import Tensor, nn
 
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.data.window import HEIGHTS
-from erfsfm.geometry.camera import scale_intrinsics
-from erfsfm.geometry.transforms import pose_vector_to_matrix, project_into_source, sample
-from erfsfm.losses.photometric import edge_aware_smoothness, photometric_error, second_order_smoothness
-from erfsfm.losses.structure import (
+from erfsfm.geometry import pose_vector_to_matrix, project_into_source, sample, scale_intrinsics
+from erfsfm.losses import (
     Bounds,
     disagreement,
+    edge_aware_smoothness,
     enlarged,
+    photometric_error,
     rotation_disagreement,
+    second_order_smoothness,
     step_disagreement,
     translation_disagreement,
 )

@@ -10,10 +10,12 @@ import sys
 import tempfile
 import warnings
 from datetime import timedelta
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import lightning
+import numpy as np
 import torch
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint, Timer
@@ -21,29 +23,29 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import load_model, take_over
 from erfsfm.common.errors import ConfigError
 from erfsfm.common.files import FolderLock, write_atomically
+from erfsfm.common.processes import opencv_threads
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
-from erfsfm.common.threads import opencv_threads
 from erfsfm.config import UNTRAINED, ExperimentConfig, Precision
-from erfsfm.data.exact_depth import stacked
+from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, by_label, labels_mb, stacked
 from erfsfm.data.split import split_recordings, usable
-from erfsfm.evaluation.many_view_truth import many_view_errors
+from erfsfm.evaluation.protocols import many_view_errors
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
-from erfsfm.training.keeper import StepProgress, WeightKeeper
+from erfsfm.model_record import find_weights, read_record
+from erfsfm.training.keeper import MEASUREMENTS, OutputFolder, StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
-from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
-from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
 
@@ -300,3 +302,58 @@ class AtomicCheckpoints(TorchCheckpointIO):
         content = io.BytesIO()  # as in `save_model`
         torch.save(checkpoint, content)
         write_atomically(Path(path), content.getvalue())
+
+
+def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """``(H, W)``, unscaled, of an image ``(H, W, 3)``, by the networks whose poses the teacher uses."""
+    return np.reciprocal(_predictor(weights).depth(image))
+
+
+@lru_cache(maxsize=1)
+def _predictor(weights: str) -> DepthPosePredictor:
+    """In this process."""
+    return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
+
+
+def imitated(config: ExperimentConfig) -> Learned | None:
+    """Inverse depth in network units as the reference camera would see it, by the network that is imitated, if any."""
+    return partial(learned_inverse_depth, config.teacher.slam_weights) if config.teacher.views == "network" else None
+
+
+def seen_by_imitated(config: ExperimentConfig) -> list[str]:
+    """What the imitated network was trained on, and the network that imitates it has then seen, too.
+
+    Raises:
+        CheckpointError: there are no such weights.
+        ConfigError: they have no depth network.
+    """
+    name = config.teacher.slam_weights
+    if config.teacher.views != "network":
+        return []
+    record = read_record(find_weights(name) / "model.yaml")
+    if record.networks == "pose":
+        raise ConfigError(f"teacher.slam_weights '{name}' have no depth network to imitate: name weights that have one")
+    return record.trained_on
+
+
+def measured_views(
+    recordings: list[Recording], config: ExperimentConfig, folder: Path, progress: Progress
+) -> ManyViewTeacher | None:
+    """The teacher, with what is not there yet measured; None where the experiment has no many views.
+
+    Args:
+        recordings: to train on; those with exact depth need no measurement.
+        config: of the experiment.
+        folder: of the measurements.
+        progress: told of the stage, what is done, and of how many.
+    """
+    _, measured = by_label(recordings, config)
+    if config.teacher.views != "many":
+        return None
+    size = (config.network.height, config.network.width)
+    with_depth = config.training.networks != "pose"
+    cache_mb = labels_mb(config.data)
+    learned = partial(learned_inverse_depth, config.teacher.slam_weights)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, with_depth, learned)
+    teacher.prepare(measured, config.network.sources, config.teacher.slam_weights, progress)
+    return teacher

@@ -18,7 +18,7 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split import split_recordings
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 RNG = np.random.default_rng(0)
 WAVES = RNG.uniform(-1.0, 1.0, (12, 2)) * 4.0

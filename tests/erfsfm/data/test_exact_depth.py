@@ -14,17 +14,15 @@ import torch
 from torch.utils.data import DataLoader
 
 from erfsfm.config import ExperimentConfig
+from erfsfm.data.augmentation import FOCAL_LENGTH
 from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
-from erfsfm.data.exact_depth import FARTHEST_M, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.data.samples import FOCAL_LENGTH
-from erfsfm.data.snippets import SnippetDraws, chances
+from erfsfm.data.snippets import FARTHEST_M, SnippetDraws, chances, stacked
 from erfsfm.data.split import split_recordings
 from erfsfm.data.window import HEIGHTS
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import find_weights, read_record
-from erfsfm.training.run import prepare, train
-from erfsfm.training.supervision import imitated
+from erfsfm.training.run import imitated, prepare, train
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.rooms import SimulatedRooms

@@ -18,8 +18,8 @@ from torch.utils.data import DataLoader
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
+from erfsfm.data.augmentation import FOCAL_LENGTH
 from erfsfm.data.discovery import discover
-from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
 from erfsfm.data.split import Split, read_split_file, split_recordings
 from erfsfm.data.window import snippet_motion

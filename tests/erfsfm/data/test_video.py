@@ -16,7 +16,7 @@ from erfsfm.data import many_view_teacher
 from erfsfm.data import recordings as module
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording, Video
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 FRAMES, SIZE = 40, (48, 32)
 

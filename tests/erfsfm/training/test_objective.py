@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from erfsfm.config import ExperimentConfig, load_experiment
-from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.losses.structure import Bounds
+from erfsfm.geometry import pose_vector_to_matrix
+from erfsfm.losses import Bounds
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective
 
 PLACES = [(-0.3, 0.05, -0.4), (0.2, -0.1, 0.35)]  # of the two sources; the target is at the origin

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.data.array_cache import ArrayCache, ImageCache
+from erfsfm.data.window import ArrayCache, ImageCache
 
 HEIGHT, WIDTH = 256, 512
 

@@ -159,19 +159,7 @@ def transform_points(T_a_b: Tensor, points_b: Tensor) -> Tensor:
 MINIMUM_Z = 1e-3
 
 
-@dataclass(frozen=True)
-class Projection:
-    """Where each target pixel lands in the source image.
-
-    ``grid`` ``(B, H, W, 2)`` in ``grid_sample`` coordinates (align_corners=True), ``valid`` ``(B, 1, H, W)``: in
-    front of the source camera and inside its image, boolean.
-    """
-
-    grid: Tensor
-    valid: Tensor
-
-
-def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> Projection:
+def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Project the target's points into the source camera.
 
     p_s ~ K T_source_target D(p_t) K^-1 p_t        (Zhou et al. 2017, Eq. 2)
@@ -180,6 +168,10 @@ def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> Pr
         depth: target z-depth ``(B, 1, H, W)``.
         T_source_target: ``(B, 4, 4)``.
         K: intrinsics shared by both images, ``(B, 3, 3)``.
+
+    Returns:
+        Where each pixel lands, ``(B, H, W, 2)`` in ``grid_sample`` coordinates (align_corners=True), and whether that
+        is in front of the source camera and inside its image, ``(B, 1, H, W)``.
     """
     batch, _, height, width = depth.shape
     points_source = transform_points(T_source_target, backproject(depth, K))  # (B, 3, H*W)
@@ -191,14 +183,12 @@ def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> Pr
     for axis, extent in zip(axes, extents):
         # half a thousandth of a pixel of slack: round-off must not cut the border off an identity warp
         inside = inside & (axis.abs() <= 1 + 1e-3 / extent)
-    return Projection(
-        grid=torch.cat(axes, dim=1).reshape(batch, 2, height, width).permute(0, 2, 3, 1),
-        valid=inside.reshape(batch, 1, height, width),
-    )
+    grid = torch.cat(axes, dim=1).reshape(batch, 2, height, width).permute(0, 2, 3, 1)
+    return grid, inside.reshape(batch, 1, height, width)
 
 
-def sample(image: Tensor, projection: Projection) -> Tensor:
-    """Bilinear look-up of ``image`` ``(B, C, H, W)`` at a projection; the border is repeated outside."""
+def sample(image: Tensor, grid: Tensor) -> Tensor:
+    """Bilinear look-up of ``image`` ``(B, C, H, W)`` at ``(B, H, W, 2)``; the border is repeated outside."""
     # far-outside coordinates would overflow the integer conversion inside grid_sample
-    grid = torch.nan_to_num(projection.grid, nan=2.0).clamp(-2, 2)
+    grid = torch.nan_to_num(grid, nan=2.0).clamp(-2, 2)
     return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)

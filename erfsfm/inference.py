@@ -238,6 +238,16 @@ class DepthPosePredictor:
         return output
 
 
+def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """``(H, W)``, unscaled, of an image ``(H, W, 3)``, by networks that this process reads once."""
+    return np.reciprocal(_predictor(weights).depth(image))
+
+
+@lru_cache(maxsize=1)
+def _predictor(weights: str) -> DepthPosePredictor:
+    return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
+
+
 def _input(image: NDArray[np.uint8] | Array, height: int, width: int) -> Array:
     """An image at a network's size, in [-1, 1], ``(1, 3, height, width)``."""
     require_image(image)

@@ -23,7 +23,6 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.split import usable
 from erfsfm.data.window import (
     ArrayCache,
-    ImageCache,
     Snippet,
     TeacherStructure,
     first_readable,
@@ -53,10 +52,12 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._rank = rank
-        labels = depth_mb(config) + (0 if many_views is None else labels_mb(config.data))
-        self._cache = ImageCache(config.data.cache_mb - labels, config.network.height, config.network.width)
+        size = (config.network.height, config.network.width)
+        depth_mb = config.data.cache_mb // 5 if config.data.exact > 0 or config.teacher.exact else 0
+        images_mb = config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
+        self._cache = ArrayCache(images_mb, (*size, 3), np.uint8)
         self._unreadable: set[str] = set()
-        self._exact_labels = ExactLabels((config.network.height, config.network.width), depth_mb(config))
+        self._exact_labels = ExactLabels(size, depth_mb)
         self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
@@ -88,7 +89,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             recording = self._exact[int(rng.choice(len(self._exact), p=self._exact_probabilities))]
             index = int(rng.integers(len(recording)))
             bounds, camera = self._exact_labels.bounds(recording, index), self._camera(recording)
-            return single_image(self._cache.image(recording, index), camera, bounds, self._config, rng)
+            (image,) = load_window(self._cache, Snippet(recording, index), 1)
+            return single_image(image, camera, bounds, self._config, rng)
         snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
         camera = self._camera(snippet.recording)
         seen = self._structure(snippet, images, camera)
@@ -144,7 +146,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 
     def __init__(self, recordings: Sequence[Recording], config: ExperimentConfig) -> None:
         self._network = config.network
-        self._cache = ImageCache(config.data.cache_mb, self._network.height, self._network.width)
+        self._cache = ArrayCache(config.data.cache_mb, (self._network.height, self._network.width, 3), np.uint8)
         length = config.network.sources + 1
         kept = usable(recordings, length)
         windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
@@ -233,11 +235,6 @@ class ExactLabels:
             T_source_target = snippet_motion(T_world_camera, first, sources).astype(np.float32)
             T_source_target[:, :3, 3] /= recording.camera_height_m
         return TeacherStructure(T_source_target, *self.bounds(recording, first + sources // 2))
-
-
-def depth_mb(config: ExperimentConfig) -> int:
-    """The part of ``data.cache_mb`` for exact depth."""
-    return config.data.cache_mb // 5 if config.data.exact > 0 or config.teacher.exact else 0
 
 
 def by_label(recordings: Sequence[Recording], config: ExperimentConfig) -> tuple[list[Recording], list[Recording]]:

@@ -9,6 +9,7 @@ import logging
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from math import prod
 from typing import Any, TypeVar
@@ -59,9 +60,13 @@ def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int
     return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target])
 
 
-def load_window(cache: ImageCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
-    """The images of a snippet at the networks' size, in time order."""
-    return [cache.image(snippet.recording, snippet.first + k) for k in range(length)]
+def load_window(cache: ArrayCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
+    """The images ``(H, W, 3)`` of a snippet in time order, of the size that the cache has them in."""
+    recording, (height, width, _) = snippet.recording, cache.shape
+    return [
+        cache.get((*recording.key, index), partial(recording.image, index, height, width))
+        for index in range(snippet.first, snippet.first + length)
+    ]
 
 
 def first_readable(snippets: Iterator[Snippet], read: Callable[[Snippet], T], named: set[str]) -> tuple[Snippet, T]:
@@ -110,7 +115,7 @@ class ArrayCache:
     """
 
     def __init__(self, limit_mb: int, shape: tuple[int, ...], dtype: DTypeLike) -> None:
-        self._shape = shape
+        self.shape = shape
         self._dtype = np.dtype(dtype)
         self._capacity = limit_mb * 2**20 // (prod(shape) * self._dtype.itemsize)
         self._blocks: list[NDArray[Any]] = []
@@ -133,23 +138,5 @@ class ArrayCache:
         block, row = divmod(slot, _BLOCK)
         if block == len(self._blocks):
             arrays = min(_BLOCK, self._capacity - slot)
-            self._blocks.append(np.empty((arrays, *self._shape), self._dtype))
+            self._blocks.append(np.empty((arrays, *self.shape), self._dtype))
         return np.asarray(self._blocks[block][row])
-
-
-class ImageCache:
-    """Least-recently-used cache of decoded frames, up to a size in bytes.
-
-    Args:
-        limit_mb: memory for images; 0 keeps none.
-        height: of every image.
-        width: of every image.
-    """
-
-    def __init__(self, limit_mb: int, height: int, width: int) -> None:
-        self._size = (height, width)
-        self._images = ArrayCache(limit_mb, (height, width, 3), np.uint8)
-
-    def image(self, recording: Recording, index: int) -> NDArray[np.uint8]:
-        """One frame ``(H, W, 3)``, decoded at most once while it stays in the cache."""
-        return self._images.get((*recording.key, index), lambda: recording.image(index, *self._size))

@@ -17,10 +17,9 @@ import erfsfm
 from erfsfm.checkpoint import Model, read_torch, save_model
 from erfsfm.common.config_tree import read_yaml
 from erfsfm.common.errors import ConfigError, TrainingError
-from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress, duration
 from erfsfm.common.readers.frame_range import merge
-from erfsfm.config import ExperimentConfig, TrainingConfig, dump_yaml, load_experiment
+from erfsfm.config import ExperimentConfig, TrainingConfig, load_experiment
 from erfsfm.model_record import ModelRecord, commit, read_record
 from erfsfm.training.module import SelfSupervision, decisive
 
@@ -220,7 +219,7 @@ class OutputFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.checkpoint = path / "checkpoints" / "last.ckpt"
+        self.checkpoint, self.config = path / "checkpoints" / "last.ckpt", path / CONFIG
 
     def require_free(self) -> None:
         """Accept a folder that is new, empty, or of a run that failed before its first checkpoint.
@@ -241,8 +240,8 @@ class OutputFolder:
                 f"{self.path} holds files that 'erfsfm train' did not write ({foreign[0]}): choose a new or empty "
                 "--output; nothing was changed"
             )
-        if (self.path / CONFIG).is_file():
-            load_experiment(self.path / CONFIG)  # of another program it would be replaced
+        if self.config.is_file():
+            load_experiment(self.config)  # of another program it would be replaced
 
     def resumable_steps(self, config: ExperimentConfig) -> int:
         """Steps done at the last checkpoint.
@@ -251,11 +250,16 @@ class OutputFolder:
             TrainingError: nothing to resume, or a damaged checkpoint; one line.
             ConfigError: the run began with another network, or with what the optimiser's state does not fit; one line.
         """
-        written = self.path / CONFIG
+        written = self.config
         for needed in (self.checkpoint, written):
             if not needed.is_file():
                 raise TrainingError(f"nothing to resume in {self.path}: no {needed.name}; start without --resume")
-        steps = _steps_of(self.checkpoint)
+        wrong = "is damaged or no checkpoint: start again in another --output"
+        state = read_torch(self.checkpoint, TrainingError, wrong)
+        known = {"global_step", "state_dict", "optimizer_states", "loops", "known"}
+        is_whole = isinstance(state, dict) and known <= state.keys()
+        if not is_whole or {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
+            raise TrainingError(f"{self.checkpoint} {wrong}")
         begun, wanted = read_yaml(written), config.model_dump(mode="json")  # begun with settings of another version
         if begun["network"] != wanted["network"]:
             raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
@@ -263,19 +267,4 @@ class OutputFolder:
             before, now = begun["training"][key], wanted["training"][key]
             if before != now:
                 raise ConfigError(f"{written} began with training.{key} {before}; got {now}: resume with the same")
-        return steps
-
-    def write_config(self, config: ExperimentConfig) -> None:
-        """Write the complete configuration of the run."""
-        write_atomically(self.path / CONFIG, dump_yaml(config))
-
-
-def _steps_of(checkpoint: Path) -> int:
-    """Steps done at a checkpoint."""
-    wrong = "is damaged or no checkpoint: start again in another --output"
-    state = read_torch(checkpoint, TrainingError, wrong)
-    wanted = {"global_step", "state_dict", "optimizer_states", "loops", "known"}
-    is_whole = isinstance(state, dict) and wanted <= state.keys()
-    if not is_whole or {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
-        raise TrainingError(f"{checkpoint} {wrong}")
-    return int(state["global_step"])
+        return int(state["global_step"])

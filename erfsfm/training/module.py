@@ -45,35 +45,22 @@ class SelfSupervision(lightning.LightningModule):
         self.depth_net, self.pose_net = build_networks(config.network).values()
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self.depth_input: DepthInput | None = None  # of the network that this training goes on with
-        self._choose_trained()
+        # networks, and the stages of pretrained encoders, that keep their weights
+        self.depth_net.requires_grad_(config.training.networks != "pose")
+        self.pose_net.requires_grad_(config.training.networks != "depth")
+        if isinstance(self.depth_net, Lite0DepthNet):
+            self.depth_net.encoder.freeze(config.training.frozen_stages)
+            # depthwise convolutions are a quarter faster so
+            self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.train()  # Lightning keeps the mode of each module
         self.loss = math.nan  # of the latest step
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
         self._constant_steps = 0
 
-    def _choose_trained(self) -> None:
-        """Exclude the network, and the stages of pretrained encoders, that keep their weights."""
-        training = self.config.training
-        self.depth_net.requires_grad_(training.networks != "pose")
-        self.pose_net.requires_grad_(training.networks != "depth")
-        if isinstance(self.depth_net, Lite0DepthNet):
-            self.depth_net.encoder.freeze(training.frozen_stages)
-            # depthwise convolutions are a quarter faster so
-            self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
     def network(self, kind: NetworkKind) -> nn.Module:
         """The network of that kind."""
         return self.depth_net if kind == "depth" else self.pose_net
-
-    def take_imagenet(self) -> None:
-        """Start the encoder of a lite0 network from ImageNet's weights.
-
-        Raises:
-            ConfigError: they are not installed.
-        """
-        if isinstance(self.depth_net, Lite0DepthNet):
-            self.depth_net.encoder.take_imagenet()
 
     def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
         """Colour to [0, 1] where the networks are."""
@@ -108,10 +95,6 @@ class SelfSupervision(lightning.LightningModule):
                 "training.gradient_clip, then continue with --resume, or start again where the last checkpoint is bad "
                 "already; the weights so far are in last/"
             )
-        self._refuse_constant(spread)
-
-    def _refuse_constant(self, spread: float) -> None:
-        """Stop once the disparity has been constant in all images for `_CONSTANT_STEPS` steps."""
         self._constant_steps = self._constant_steps + 1 if spread < _CONSTANT else 0
         if self._constant_steps == _CONSTANT_STEPS:
             raise TrainingError(
@@ -224,16 +207,12 @@ class SelfSupervision(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Note and log what the first process measured, by which all of them decide what to keep."""
-        self.validation_metrics = self.trainer.strategy.broadcast(self.measured())
-        self.log_dict({f"validation/{name}": value for name, value in self.validation_metrics.items()})
-
-    def measured(self) -> dict[str, float]:
-        """Mean of every metric, and the spread of the depth scale, which limits a SLAM system's scale drift."""
         means = {name: float(np.mean(values)) for name, values in self._validation.items()}
         scales = np.array(self._validation.get("depth_scale", []))
-        if len(scales) > 1:
+        if len(scales) > 1:  # their spread limits a SLAM system's scale drift
             means["depth_scale_spread"] = float(scales.std() / scales.mean())
-        return means
+        self.validation_metrics = self.trainer.strategy.broadcast(means)
+        self.log_dict({f"validation/{name}": value for name, value in self.validation_metrics.items()})
 
     def _note(self, name: str, value: float) -> None:
         self._validation.setdefault(name, []).append(value)

@@ -193,11 +193,11 @@ class Level:
         count = self.sources.shape[1]
         depth = (1 / self.disparity).repeat_interleave(count, dim=0)  # (B*N, 1, h, w)
         K = self.K.repeat_interleave(count, dim=0)
-        projection = project_into_source(depth, T_source_target.flatten(0, 1), K)
-        warped = sample(self.sources.flatten(0, 1), projection)
+        grid, valid = project_into_source(depth, T_source_target.flatten(0, 1), K)
+        warped = sample(self.sources.flatten(0, 1), grid)
         error = photometric_error(self.target.repeat_interleave(count, dim=0), warped, ssim_weight)
         shape = (len(self.target), count, *error.shape[-2:])
-        return error.reshape(shape), projection.valid.reshape(shape)
+        return error.reshape(shape), valid.reshape(shape)
 
     def photometric(self, T_source_target: Tensor, loss: LossConfig) -> Tensor:
         """Their mean over pixels, reduced over sources as the loss wants it."""

@@ -10,12 +10,11 @@ import sys
 import tempfile
 import warnings
 from datetime import timedelta
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import lightning
-import numpy as np
 import torch
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint, Timer
@@ -23,7 +22,6 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -34,15 +32,16 @@ from erfsfm.common.processes import opencv_threads
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
-from erfsfm.config import UNTRAINED, ExperimentConfig, Precision
-from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
+from erfsfm.config import UNTRAINED, ExperimentConfig, Precision, dump_yaml
+from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, by_label, labels_mb, stacked
 from erfsfm.data.split import split_recordings, usable
 from erfsfm.evaluation.protocols import many_view_errors
-from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
+from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16, learned_inverse_depth
 from erfsfm.model_record import find_weights, read_record
+from erfsfm.networks.lite0 import Lite0DepthNet
 from erfsfm.training.keeper import MEASUREMENTS, OutputFolder, StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
@@ -107,7 +106,7 @@ def train(
     with raising_on_termination(), FolderLock() as lock:
         if rank == 0:
             lock.take(output)
-            folder.write_config(config)
+            write_atomically(folder.config, dump_yaml(config))
         _fit(trainer, module, loader, validation_loader, folder.checkpoint, resume)
     keeper.save(trainer, module)
     if not trainer.is_global_zero:
@@ -166,7 +165,9 @@ def _draws(
     together = config.training.batch * config.training.devices
     views = measured_views(training, config, config.teacher.cache or output / MEASUREMENTS, progress)
     last, done = config.training.steps * together, done_steps * together
-    return SnippetDraws(training, config, last, done, rank, views, imitated(config))
+    imitates = config.teacher.views == "network"
+    imitated = partial(learned_inverse_depth, config.teacher.slam_weights) if imitates else None
+    return SnippetDraws(training, config, last, done, rank, views, imitated)
 
 
 def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> DataLoader[dict[str, Tensor]]:
@@ -220,8 +221,8 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
             "is none: name weights that have one as initial_weights, or set teacher.views=many, or "
             "loss.photometric_weight=0"
         )
-    if name != "none" and "depth" not in loaded:
-        module.take_imagenet()
+    if name != "none" and "depth" not in loaded and isinstance(module.depth_net, Lite0DepthNet):
+        module.depth_net.encoder.take_imagenet()
     if model is None:
         return []
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "alignment")}
@@ -302,22 +303,6 @@ class AtomicCheckpoints(TorchCheckpointIO):
         content = io.BytesIO()  # as in `save_model`
         torch.save(checkpoint, content)
         write_atomically(Path(path), content.getvalue())
-
-
-def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """``(H, W)``, unscaled, of an image ``(H, W, 3)``, by the networks whose poses the teacher uses."""
-    return np.reciprocal(_predictor(weights).depth(image))
-
-
-@lru_cache(maxsize=1)
-def _predictor(weights: str) -> DepthPosePredictor:
-    """In this process."""
-    return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
-
-
-def imitated(config: ExperimentConfig) -> Learned | None:
-    """Inverse depth in network units as the reference camera would see it, by the network that is imitated, if any."""
-    return partial(learned_inverse_depth, config.teacher.slam_weights) if config.teacher.views == "network" else None
 
 
 def seen_by_imitated(config: ExperimentConfig) -> list[str]:

@@ -136,9 +136,9 @@ def test_identity_returns_the_image_with_its_border(size: tuple[int, int]) -> No
     image = torch.rand(1, 3, *size)
     depth = torch.rand(1, 1, *size) * 90 + 0.1
     K = torch.tensor([[[0.58 * size[1], 0, 0.49 * size[1]], [0, 1.92 * size[0], 0.51 * size[0]], [0, 0, 1]]])
-    projection = project_into_source(depth, torch.eye(4)[None], K)
-    assert projection.valid.all(), "round-off must not cut the border off"
-    torch.testing.assert_close(sample(image, projection), image, rtol=0, atol=2e-4)
+    grid, valid = project_into_source(depth, torch.eye(4)[None], K)
+    assert valid.all(), "round-off must not cut the border off"
+    torch.testing.assert_close(sample(image, grid), image, rtol=0, atol=2e-4)
 
 
 @pytest.mark.parametrize("shift", [1, 3, -2])
@@ -146,35 +146,35 @@ def test_sideways_motion_shifts_a_plane_by_whole_pixels(shift: int) -> None:
     """A plane at 5 m, focal length 50: the source sees its points ``50 t / 5`` pixels further right."""
     width, height = 40, 20
     image = torch.rand(1, 3, height, width)
-    projection = project_into_source(torch.full((1, 1, height, width), 5.0), moved(shift * 0.1, 0, 0), camera(40, 20))
-    warped = sample(image, projection)
+    grid, valid = project_into_source(torch.full((1, 1, height, width), 5.0), moved(shift * 0.1, 0, 0), camera(40, 20))
+    warped = sample(image, grid)
     expected = torch.roll(image, -shift, dims=3)
     inside = torch.zeros(width, dtype=torch.bool)
     inside[max(-shift, 0) : width - max(shift, 0)] = True
-    assert torch.equal(projection.valid[0, 0], inside.expand(height, width))
+    assert torch.equal(valid[0, 0], inside.expand(height, width))
     torch.testing.assert_close(warped[..., inside], expected[..., inside], rtol=0, atol=1e-4)
 
 
 def test_forward_motion_by_hand() -> None:
     """A point 10 m ahead is 8 m ahead of a source camera 2 m further on: T_source_target has t_z = -2."""
-    projection = project_into_source(torch.full((1, 1, 21, 41), 10.0), moved(0, 0, -2), camera(41, 21))
+    grid, _ = project_into_source(torch.full((1, 1, 21, 41), 10.0), moved(0, 0, -2), camera(41, 21))
     # a pixel 8 right of the centre moves to 8 * 10 / 8 = 10 right of it
-    assert float(projection.grid[0, 10, 28, 0]) == pytest.approx(2 * (20 + 10) / 40 - 1, abs=1e-6)
-    assert float(projection.grid[0, 10, 28, 1]) == pytest.approx(0, abs=1e-6)
+    assert float(grid[0, 10, 28, 0]) == pytest.approx(2 * (20 + 10) / 40 - 1, abs=1e-6)
+    assert float(grid[0, 10, 28, 1]) == pytest.approx(0, abs=1e-6)
 
 
 def test_points_behind_the_camera_are_invalid() -> None:
     depth = torch.full((1, 1, 11, 11), 3.0)
-    assert not project_into_source(depth, moved(0, 0, -5), camera(11, 11)).valid.any()
-    assert not project_into_source(depth, moved(0, 0, -3), camera(11, 11)).valid.any(), "nor those in its plane"
+    assert not project_into_source(depth, moved(0, 0, -5), camera(11, 11))[1].any()
+    assert not project_into_source(depth, moved(0, 0, -3), camera(11, 11))[1].any(), "nor those in its plane"
 
 
 @pytest.mark.parametrize("bad", [float("inf"), float("nan"), 1e30])
 def test_extreme_depth_gives_finite_values(bad: float) -> None:
     image = torch.rand(1, 3, 8, 8)
     depth = torch.full((1, 1, 8, 8), bad)
-    projection = project_into_source(depth, moved(1e5, 0, 0), camera(8, 8))
-    assert torch.isfinite(sample(image, projection)).all()
+    grid, _ = project_into_source(depth, moved(1e5, 0, 0), camera(8, 8))
+    assert torch.isfinite(sample(image, grid)).all()
 
 
 def test_gradient_of_the_projection() -> None:
@@ -182,7 +182,7 @@ def test_gradient_of_the_projection() -> None:
     vector = torch.tensor([[0.1, -0.05, 0.2, 0.01, 0.02, -0.03]]).double().requires_grad_()
     K = camera(4, 3, 5.0).double()
     assert torch.autograd.gradcheck(
-        lambda d, v: project_into_source(d, pose_vector_to_matrix(v), K).grid, (depth, vector)
+        lambda d, v: project_into_source(d, pose_vector_to_matrix(v), K)[0], (depth, vector)
     )
 
 
@@ -192,8 +192,8 @@ def test_gradient_of_the_sample() -> None:
     T = moved(0.113, -0.057, 0).double()
 
     def warp(image: Tensor, depth: Tensor) -> Tensor:
-        projection = project_into_source(depth, T, camera(7, 6, 20.0).double())
-        return sample(image, projection) * projection.valid
+        grid, valid = project_into_source(depth, T, camera(7, 6, 20.0).double())
+        return sample(image, grid) * valid
 
     assert torch.autograd.gradcheck(warp, (image, depth))
 
@@ -204,8 +204,8 @@ def test_warp_finds_the_target_in_a_rendered_source(plane) -> None:
     source = torch.from_numpy(plane.colours(there)).permute(2, 0, 1)[None]
     T_source_target = moved(*(-there)).double()
     depth = torch.full((1, 1, 64, 96), plane.distance).double()
-    projection = project_into_source(depth, T_source_target, torch.from_numpy(plane.camera.K)[None].double())
-    error = (sample(source, projection) - target).abs()[projection.valid.expand_as(target)]
-    assert projection.valid.float().mean() > 0.6
+    grid, valid = project_into_source(depth, T_source_target, torch.from_numpy(plane.camera.K)[None].double())
+    error = (sample(source, grid) - target).abs()[valid.expand_as(target)]
+    assert valid.float().mean() > 0.6
     assert float(error.mean()) < 5e-3
     assert float((source - target).abs().mean()) > 0.05, "the images differ before the warp"

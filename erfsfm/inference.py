@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from erfsfm.common.errors import CheckpointError, ConfigError
+from erfsfm.common.errors import CheckpointError, ConfigError, DataError
 from erfsfm.common.processes import usable_cores
 from erfsfm.common.readers.camera_file import MOST_PIXELS
 from erfsfm.common.readers.frame_range import overlapping
@@ -236,6 +236,15 @@ class DepthPosePredictor:
         if not np.isfinite(output).all():
             raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
         return output
+
+
+def refuse_leak(networks: DepthPosePredictor, names: Sequence[str], allow_leak: bool) -> bool:
+    """Whether some of the frames were trained on; ``DataError`` where that was not allowed."""
+    leaked = networks.leaks(names)
+    if leaked and not allow_leak:
+        some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")
+        raise DataError(f"leak: these weights were trained on {some}; choose other weights or data, or --allow-leak")
+    return bool(leaked)
 
 
 def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.mvs import refine
-from erfsfm.mvs.flow import Array, Grey, MeasuredDepth, measure, rays
 from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.views import Appearance
 
@@ -42,8 +41,7 @@ def label(
         K: camera matrix of these images.
         T_neighbour_target: ``(N, 4, 4)``, translations in camera heights.
     """
-    measured = measure(target, neighbours, K, T_neighbour_target, fine=True)
-    inverse_depth, sigma = measured.inverse_depth, measured.sigma
+    inverse_depth, sigma = measure(target, neighbours, K, T_neighbour_target, fine=True)
     at_least = np.zeros_like(inverse_depth)
     reliable = inverse_depth > MIN_SNR * sigma
     p = rays(target.shape[0], target.shape[1], K)
@@ -145,12 +143,12 @@ def shrunk(least: Array, most: Array, factor: int) -> tuple[Array, Array]:
     return np.exp(known_low).astype(np.float32), np.exp(known_high).astype(np.float32)
 
 
-def in_camera_heights(learned: Array, measured: MeasuredDepth) -> Array | None:
+def in_camera_heights(learned: Array, measured: Array, sigma: Array) -> Array | None:
     """Inverse depth ``(H, W)`` of any unit scaled to what is measured without it; None where too little is."""
-    known = measured.inverse_depth > MIN_SNR * measured.sigma
+    known = measured > MIN_SNR * sigma
     if known.sum() < LEAST_KNOWN:
         return None
-    return learned * np.float32(np.median(measured.inverse_depth[known] / learned[known]))
+    return learned * np.float32(np.median(measured[known] / learned[known]))
 
 
 @lru_cache(maxsize=1)
@@ -269,3 +267,98 @@ def impose_road(
     level = on_road(inverse_depth, reliable, road) & ~under & fillable
     inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
     return at_least
+
+
+Grey = NDArray[np.uint8]
+Array = NDArray[np.float32]
+
+FLOW_NOISE_PX = 0.3
+ROUND_TRIP_PX = 0.5
+OFF_LINE_PX = 1.0
+OUTLIER_SIGMAS = 3.0  # from the median of the neighbours
+LEAST_VIEWS = 2
+
+
+def measure(
+    target: Grey,
+    neighbours: Sequence[Grey],
+    K: NDArray[np.floating],
+    T_neighbour_target: NDArray[np.float64],
+    fine: bool = False,
+) -> tuple[Array, Array]:
+    """Inverse depth of the target's pixels where at least two neighbours agree.
+
+    Args:
+        target: grey image ``(H, W)``.
+        neighbours: N images of the same camera.
+        K: camera matrix ``(3, 3)`` of these images.
+        T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
+        fine: flow down to single pixels, four times as slow.
+
+    Returns:
+        Inverse depth ``(H, W)`` in one over the unit of the poses, and its sigma, infinite where unknown.
+    """
+    values, sigmas = [], []
+    for image, T in zip(neighbours, T_neighbour_target):
+        flow, trusted = optical_flow(target, image, fine)
+        d, sigma, off_line_px = triangulate(flow, T, K)
+        sigma[~trusted | (off_line_px > OFF_LINE_PX)] = np.inf
+        values.append(d)
+        sigmas.append(sigma)
+    return combine(np.stack(values), np.stack(sigmas))
+
+
+def combine(values: Array, sigmas: Array) -> tuple[Array, Array]:
+    """Weighted mean of the neighbours ``(N, H, W)`` that agree with their weighted median."""
+    known = np.isfinite(sigmas)
+    weights = np.where(known, 1 / np.square(sigmas), 0).astype(np.float32)
+    order = np.argsort(np.where(known, values, np.inf), axis=0)
+    ranked = np.take_along_axis(weights, order, axis=0).cumsum(axis=0)
+    middle = (ranked >= ranked[-1] / 2).argmax(axis=0)
+    median = np.take_along_axis(values, np.take_along_axis(order, middle[None], axis=0), axis=0)[0]
+    agree = known & (np.abs(values - median) < OUTLIER_SIGMAS * sigmas)
+    weights *= agree
+    total = weights.sum(axis=0)
+    mean = (values * weights).sum(axis=0) / np.maximum(total, 1e-12)
+    spread = (weights * np.square(values - mean)).sum(axis=0) / np.maximum(total, 1e-12)
+    sigma = np.sqrt(1 / np.maximum(total, 1e-12) + spread)
+    sigma[agree.sum(axis=0) < LEAST_VIEWS] = np.inf
+    return mean.astype(np.float32), sigma.astype(np.float32)
+
+
+def rays(height: int, width: int, K: NDArray[np.floating]) -> Array:
+    """``K^-1 (u, v, 1)`` of every pixel, ``(H, W, 3)``."""
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1).astype(np.float32)
+
+
+def optical_flow(first: Grey, second: Grey, fine: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Optical flow ``(H, W, 2)`` and the mask of the forward-backward check ``(H, W)``."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    if fine:
+        search.setFinestScale(0)
+        search.setGradientDescentIterations(8)
+    there = search.calc(first, second, None)
+    back = search.calc(second, first, None)
+    v, u = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
+    back_there = cv2.remap(
+        back, u + there[..., 0], v + there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1e3
+    )
+    return there, np.linalg.norm(there + back_there, axis=-1) < ROUND_TRIP_PX
+
+
+def triangulate(
+    flow: Array, T_second_first: NDArray[np.float64], K: NDArray[np.floating]
+) -> tuple[Array, Array, Array]:
+    """Inverse depth d with ``pi(R p + d t)`` nearest to the flow's end point, its sigma, and the residual in pixels."""
+    R, t = T_second_first[:3, :3].astype(np.float32), T_second_first[:3, 3].astype(np.float32)
+    p = rays(flow.shape[0], flow.shape[1], K)
+    q = p @ R.T
+    fx, fy = np.float32(K[0, 0]), np.float32(K[1, 1])
+    x, y = p[..., 0] + flow[..., 0] / fx, p[..., 1] + flow[..., 1] / fy
+    a_x, b_x = t[0] - x * t[2], x * q[..., 2] - q[..., 0]
+    a_y, b_y = t[1] - y * t[2], y * q[..., 2] - q[..., 1]
+    parallax = a_x**2 + a_y**2 + np.float32(1e-12)
+    d = (a_x * b_x + a_y * b_y) / parallax
+    off_line_px = np.hypot(d * a_x - b_x, d * a_y - b_y) * fx
+    return d, FLOW_NOISE_PX / (np.sqrt(parallax) * fx), off_line_px

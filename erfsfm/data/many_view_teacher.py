@@ -30,8 +30,7 @@ from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import ArrayCache, TeacherStructure, snippet_motion
 from erfsfm.geometry import Camera
-from erfsfm.labels import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
-from erfsfm.mvs.flow import Grey, measure
+from erfsfm.labels import NEIGHBOURS, Grey, in_camera_heights, label, measure, refined_label, shrunk
 from erfsfm.mvs.views import neighbours_around
 
 VERSION = 4
@@ -158,7 +157,7 @@ class DriveLabels:
         grey, K, motion = _grey(image), camera.K.astype(np.float64), self._motion(target, around)
         if learned is None:
             return label(grey, [*around.values()], K, motion)
-        inverse_depth = in_camera_heights(learned(image), measure(grey, [*around.values()], K, motion))
+        inverse_depth = in_camera_heights(learned(image), *measure(grey, [*around.values()], K, motion))
         if inverse_depth is None:
             return None
         frames = np.arange(len(self.recording))

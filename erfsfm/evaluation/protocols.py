@@ -33,9 +33,9 @@ from erfsfm.evaluation.depth_metrics import (
     mean_ratio,
     standard_error,
 )
+from erfsfm.evaluation.eigen import RawFrame, lidar_depth
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
-from erfsfm.evaluation.raw_drives import RawFrame, lidar_depth
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import DepthPosePredictor, refuse_leak
 
 _BASELINE = "median depth map"
 _PICTURE_WIDTH = 620
@@ -209,15 +209,6 @@ def _depth_row(method: str, streets: list[list[DepthErrors]], before: list[list[
     scales = np.array([each.scale for errors in streets for each in errors])
     row["scale_spread"] = float(scales.std() / scales.mean())
     return row | {"images": len(scales), "streets": len(streets)}
-
-
-def refuse_leak(networks: DepthPosePredictor, names: Sequence[str], allow_leak: bool) -> bool:
-    """Whether some of the frames were trained on; ``DataError`` where that was not allowed."""
-    leaked = networks.leaks(names)
-    if leaked and not allow_leak:
-        some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")
-        raise DataError(f"leak: these weights were trained on {some}; choose other weights or data, or --allow-leak")
-    return bool(leaked)
 
 
 CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof

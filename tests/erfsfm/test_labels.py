@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from functools import cache
 
 import cv2
@@ -12,17 +13,21 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.labels import (
     NEIGHBOURS,
+    Array,
+    combine,
     direction_of_travel,
     in_camera_heights,
     label,
+    measure,
     on_road,
+    rays,
     refined_label,
     road_plane,
     shrunk,
     sky_mask,
+    triangulate,
     under_road,
 )
-from erfsfm.mvs.flow import Array, measure, rays
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -30,20 +35,20 @@ FRAME, NEAR = 60, (-1, 1, 3)
 
 
 @cache
-def street() -> SimulatedStreet:
+def long_street() -> SimulatedStreet:
     return SimulatedStreet(SimulationOptions(frames=250, seed=703))
 
 
 @cache
 def grey(frame: int) -> NDArray[np.uint8]:
-    return street().render(frame).image[..., 1].copy()
+    return long_street().render(frame).image[..., 1].copy()
 
 
 def seen(frame: int, others: tuple[int, ...]) -> tuple[NDArray[np.uint8], list[NDArray[np.uint8]], Array, Array]:
     """A frame, its neighbours, their camera, and ``T_neighbour_target`` in camera heights."""
-    T = np.linalg.inv(street().T_world_camera[[frame + k for k in others]]) @ street().T_world_camera[frame]
-    T[:, :3, 3] /= street().camera_height_m
-    return grey(frame), [grey(frame + k) for k in others], street().K, T
+    T = np.linalg.inv(long_street().T_world_camera[[frame + k for k in others]]) @ long_street().T_world_camera[frame]
+    T[:, :3, 3] /= long_street().camera_height_m
+    return grey(frame), [grey(frame + k) for k in others], long_street().K, T
 
 
 @cache
@@ -54,8 +59,8 @@ def by_flow(frame: int) -> tuple[Array, Array]:
 @cache
 def truth(frame: int) -> Array:
     """Inverse depth in camera heights, 0 where it is unknown."""
-    depth = street().depth(frame)
-    return np.where(depth > 0, street().camera_height_m / np.maximum(depth, 1e-6), 0).astype(np.float32)
+    depth = long_street().depth(frame)
+    return np.where(depth > 0, long_street().camera_height_m / np.maximum(depth, 1e-6), 0).astype(np.float32)
 
 
 def errors(bounds: tuple[Array, Array], true: Array) -> tuple[Array, float]:
@@ -100,7 +105,7 @@ def test_direction_of_travel_is_forward_and_unknown_at_rest():
 
 def test_more_is_known_than_by_flow_alone_and_it_is_as_right() -> None:
     network = 7 * cv2.GaussianBlur(truth(FRAME), (0, 0), 4) ** np.float32(0.9) + np.float32(0.05)  # in its own unit
-    learned = in_camera_heights(network, measure(*seen(FRAME, NEIGHBOURS)))
+    learned = in_camera_heights(network, *measure(*seen(FRAME, NEIGHBOURS)))
     assert learned is not None
     bounds = refined_label(*seen(FRAME, NEAR), learned)
     refined, known = errors(bounds, truth(FRAME))
@@ -126,7 +131,7 @@ def test_no_scale_where_flow_measures_nothing() -> None:
     blank = np.full((64, 128), 120, np.uint8)
     _, _, K, T_neighbour_target = seen(FRAME, (-1, 1))
     measured = measure(blank, [blank] * 2, K, T_neighbour_target)
-    assert in_camera_heights(np.ones((64, 128), np.float32), measured) is None
+    assert in_camera_heights(np.ones((64, 128), np.float32), *measured) is None
 
 
 def test_a_smaller_label_is_wide_at_edges_and_unknown_where_a_pixel_is():
@@ -177,3 +182,59 @@ def test_a_car_at_the_cameras_speed_gets_no_far_depth():
     under = under_road(inverse_depth, sigma, road)
     assert under[75:88, 192:228].all()
     assert not under[:66].any() and not under[95:].any() and not under[:, :180].any()
+
+
+@pytest.fixture(scope="module")
+def street() -> SimulatedStreet:
+    street = SimulatedStreet(SimulationOptions(frames=250, seed=702, width=312, height=96))
+    street.render = functools.cache(street.render)
+    return street
+
+
+def _measured(street, index, neighbours, error=None):
+    T = np.linalg.inv(street.T_world_camera[neighbours]) @ street.T_world_camera[index]
+    if error is not None:
+        T = error @ T
+    grey = [street.render(k).image[..., 1].copy() for k in (index, *neighbours)]
+    return measure(grey[0], grey[1:], street.K, T, fine=True)
+
+
+@pytest.mark.parametrize("index", [40, 120])
+def test_depth_is_metric_and_its_sigma_tells_where_it_is_known(street, index):
+    inverse_depth, sigma = _measured(street, index, [index + k for k in (-4, -2, -1, 1, 2, 4)])
+    truth = street.render(index).depth
+    known = np.isfinite(sigma) & (truth > 0) & (truth < 80) & (sigma < 0.2 * inverse_depth)
+    assert known.mean() > 0.3
+    error = np.abs(inverse_depth[known] * truth[known] - 1)
+    assert np.median(error) < 0.04
+
+
+def test_wrong_poses_leave_little_that_seems_known(street):
+    turned = np.eye(4)
+    turned[:3, :3] = np.array([[1, 0, 0.0], [0, np.cos(0.02), -np.sin(0.02)], [0, np.sin(0.02), np.cos(0.02)]])
+    neighbours = [120 + k for k in (-4, -2, -1, 1, 2, 4)]
+    (_, right), (_, wrong) = _measured(street, 120, neighbours), _measured(street, 120, neighbours, turned)
+    assert np.isfinite(wrong).mean() < 0.5 * np.isfinite(right).mean()
+
+
+def test_a_flow_made_from_a_depth_gives_that_depth_back():
+    K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1.0]])
+    T = np.eye(4)
+    T[:3, 3] = [0.1, -0.05, -1.0]
+    inverse_depth = np.full((128, 416), 1 / 12, np.float32)
+    p = rays(128, 416, K)
+    moved = p + inverse_depth[..., None] * T[:3, 3].astype(np.float32)
+    flow = np.stack([240 * (moved[..., k] / moved[..., 2] - p[..., k]) for k in range(2)], axis=-1)
+    got, sigma, off_line_px = triangulate(flow.astype(np.float32), T, K)
+    away = np.hypot(p[..., 0] + 0.1, p[..., 1] - 0.05) > 0.1  # from the focus of expansion
+    np.testing.assert_allclose(got[away], 1 / 12, rtol=2e-3)
+    assert off_line_px.max() < 0.02 and sigma[away].max() < sigma.max()
+
+
+def test_a_lone_outlier_is_left_out_and_one_view_alone_is_not_believed():
+    values = np.array([0.1, 0.101, 0.5, 0.1], np.float32).reshape(4, 1, 1) * np.ones((4, 1, 2), np.float32)
+    sigmas = np.full((4, 1, 2), 0.002, np.float32)
+    sigmas[:3, 0, 1] = np.inf
+    inverse_depth, sigma = combine(values, sigmas)
+    assert inverse_depth[0, 0] == pytest.approx(0.1003, rel=1e-2)
+    assert np.isfinite(sigma[0, 0]) and np.isinf(sigma[0, 1])

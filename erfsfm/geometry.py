@@ -1,7 +1,7 @@
-"""The pinhole camera, and its matrix under resize, crop and flip.
+"""The pinhole camera and its matrix under resize, crop and flip; SE(3) on tensors; the inverse warp (Zhou et al. 2017).
 
 Pixel (0, 0) is the centre of the top-left pixel, so a resize by s moves the principal point as
-``c' = (c + 0.5) s - 0.5``.
+``c' = (c + 0.5) s - 0.5``. The inverse warp is a source image seen from the target camera.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Depth of one image from many neighbours at the poses of the SLAM system: by flow alone, or learned depth refined.
 
-Lengths are in heights of the camera over the road.
+Lengths are in heights of the camera over the road, the ground plane before the camera. Dense inverse search flow
+(Kroeger et al. 2016) to each neighbour, checked forwards and backwards, gives the inverse depth whose projection lies
+nearest to the flow's end point; the neighbours' answers are averaged where they agree.
 """
 
 from __future__ import annotations

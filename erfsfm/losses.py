@@ -1,4 +1,4 @@
-"""Photometric error between a target image and a source warped onto it, and smoothness of depth."""
+"""Photometric error between a target and a source warped onto it, smoothness of depth, and errors against labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work in other processes: spread over several of this program, or a run of the SLAM system."""
+"""Work in other processes and threads, a run of the SLAM system as a process, and the threads that libraries start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random flip, scale-crop, colour and weather of a whole snippet, with its camera."""
+"""A training sample: a snippet under random flip, scale-crop, colour and weather, with its camera and labels."""
 
 from __future__ import annotations
 

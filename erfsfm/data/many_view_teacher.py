@@ -1,7 +1,8 @@
 """The many-view teacher of whole drives: poses by the SLAM system once a drive, then a label for every few frames.
 
 All of it is kept in a folder under a digest of the drive's images and camera, so that it is computed once. In a
-prepared folder a label is a small picture: bounds are rounded by a third of a sigma on average.
+prepared folder a label is a small picture: bounds are rounded by a third of a sigma on average. The networks' package
+does not import the SLAM system: what goes between them are a folder of images and a trajectory.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Windows of consecutive frames with the target in the middle, as training samples.
+"""Windows of consecutive frames with the target in the middle, as training samples; labels of simulated worlds.
 
 Sample number i is a pure function of the seed and i: which recording, which window, which
 augmentation. A run resumed at step k therefore draws the same samples as an uninterrupted one.

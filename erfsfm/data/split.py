@@ -4,6 +4,10 @@ Names are those of `erfsfm.common.readers.frame_range`.
 
 The shipped ones lie in ``configs/splits``. Single frames are written as runs: ``[0:64:3, 69, 72]`` are the frames
 0, 3, ..., 63, 69 and 72.
+
+Frames in which the car stands still are left out: there only traffic moves, which gives a wrong depth. They are told by
+the speed of the GPS/IMU, or by image differences where there is none. A packet or an image that cannot be read is taken
+for one of a moving car.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Windows of consecutive frames, and what is known of them.
+"""Windows of consecutive frames, what is known of them, and the cache that their images are read through.
 
 A file that cannot be read costs the windows that hold it, not a night of training.
 """

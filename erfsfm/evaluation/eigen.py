@@ -1,4 +1,8 @@
-"""Depth on single frames of KITTI raw drives against LiDAR (Eigen et al. 2014), with both scales of the paper."""
+"""Depth on single frames of KITTI raw drives against LiDAR (Eigen et al. 2014), with both scales of the paper.
+
+Layout: ``ROOT/2011_09_26/2011_09_26_drive_0013_sync/{image_02,velodyne_points,oxts}/data``, calibration in the folder
+of the date (`erfsfm.common.readers.kitti`). Images may be smaller than the original; the calibration follows.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Evaluation protocols: trained networks on recordings with ground truth, beside a baseline that uses no image."""
+"""Evaluation protocols: trained networks on recordings with ground truth, beside a baseline that uses no image.
+
+True depth is that of streets: simulated worlds, KITTI raw drives with LiDAR, and folders of images beside depth maps.
+On other drives static surfaces are measured from neighbouring frames at a run's poses.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Learned depth as a prior, neighbouring images at known poses as the measurement.
 
-A plane sweep around the prior at half size, smoothed semi-globally, finds each pixel's change of depth; it is brought
+A plane sweep (Collins 1996, Gallup et al. 2007) around the prior at half size finds each pixel's change of depth. Its
+costs are smoothed by semi-global matching (Hirschmüller 2008) along four directions, in integers. The change is brought
 to full size along the edges of the image and sharpened by Gauss-Newton steps on all neighbours at once.
 """
 

@@ -6,7 +6,8 @@ squares; the depth of a cell is known hardly at all, so that parallax of somethi
 an image shows nothing to follow, the guess stays.
 
 Within a snippet a camera moves steadily: its path is made of equal steps in the guessed direction of travel, which
-turns with the camera. Nothing here is learned.
+turns with the camera. Nothing here is learned, and all of it is tensors and plain operators, so that networks can be
+exported.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Callbacks of a training: the weights that it writes, the latest and the best, and what it says of its steps."""
+"""The output folder of a training, and what fills it: the latest and the best weights, and what is said of steps."""
 
 from __future__ import annotations
 

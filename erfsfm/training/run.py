@@ -1,4 +1,4 @@
-"""One training run; its output folder is what ``--weights`` takes."""
+"""One training run; its output folder is what ``--weights`` takes. Labels are measured before the first step."""
 
 from __future__ import annotations
 

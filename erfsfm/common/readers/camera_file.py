@@ -1,4 +1,4 @@
-"""``camera.yaml``: the calibration of a user's own camera."""
+"""``camera.yaml``: the calibration of a user's own camera; intrinsics under a resize, and a check of their values."""
 
 from __future__ import annotations
 

@@ -77,8 +77,17 @@ def convert(
         networks[network.kind] = network
     if dilated and "pose" not in networks:
         raise CheckpointError("dilated needs a pose network: the reference's dilated DispNetS cannot run")
+    settings: dict[str, Any] = {"fidelity": "paper", "height": size[0], "width": size[1]}
+    for kind, network in networks.items():
+        settings |= {kind: network.preset, f"{kind}_width": network.width}
+    if "pose" in networks:
+        settings |= {"sources": networks["pose"].sources}
+    try:
+        config = NetworkConfig.model_validate(settings)
+    except ValidationError as error:
+        raise CheckpointError(f"no network of ours has such layers: {first_problem(error)}") from error
     record = ModelRecord(
-        network=_config(networks, size),
+        network=config,
         networks="both" if len(networks) == 2 else next(iter(networks)),
         trained_on=list(trained_on) or ["unknown"],
         licence="unknown: ask the authors of the weights",
@@ -200,15 +209,3 @@ def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     if len(found) != 5:
         raise CheckpointError(f"{where} must hold offsets, modulator and kernel; found {', '.join(sorted(parts))}")
     return found
-
-
-def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -> NetworkConfig:
-    settings: dict[str, Any] = {"fidelity": "paper", "height": size[0], "width": size[1]}
-    for kind, network in networks.items():
-        settings |= {kind: network.preset, f"{kind}_width": network.width}
-    if "pose" in networks:
-        settings |= {"sources": networks["pose"].sources}
-    try:
-        return NetworkConfig.model_validate(settings)
-    except ValidationError as error:
-        raise CheckpointError(f"no network of ours has such layers: {first_problem(error)}") from error

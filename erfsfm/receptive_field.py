@@ -210,22 +210,19 @@ def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Te
 
 def street_snippet(frames: int, height: int, width: int) -> list[NDArray[np.uint8]]:
     """Consecutive views ``(height, width, 3)`` uint8 RGB of a straight drive between walls, a metre a frame."""
-    return [_view(height, width, float(k)) for k in range(frames)]
-
-
-def _view(height: int, width: int, z_m: float) -> NDArray[np.uint8]:
     v, u = np.mgrid[:height, :width]
     ray_x = (u - (width - 1) / 2) / (_FOCAL_SHARE * width)
     ray_y = (v - (height - 1) / 2) / (_FOCAL_SHARE * width)
     to_road = _HEIGHT_M / np.maximum(ray_y, 1e-6)  # z-depth in metres
     to_wall = _HALF_WIDTH_M / np.maximum(np.abs(ray_x), 1e-6)
     depth = np.minimum(to_road, to_wall)
-    x, y, z = ray_x * depth, ray_y * depth, z_m + depth
-    wall = to_wall < to_road
-    lane = (np.abs(np.abs(x) - 2) < 0.12) & (np.mod(z, 6) < 3)
-    window = (np.mod(z, 3) < 1.2) & (np.mod(y, 2.5) < 1.3)
-    across = np.where(wall, y, x)
-    grain = np.mean([np.sin(a * across + b * z + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9))], axis=0)
-    shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * grain
-    shade = np.where(wall & (y < -6), 0.92, shade / (1 + depth / 300))  # sky above the walls
-    return np.repeat(np.rint(255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+    x, y, wall = ray_x * depth, ray_y * depth, to_wall < to_road
+    across, views = np.where(wall, y, x), []
+    for z in (z_m + depth for z_m in range(frames)):
+        lane = (np.abs(np.abs(x) - 2) < 0.12) & (np.mod(z, 6) < 3)
+        window = (np.mod(z, 3) < 1.2) & (np.mod(y, 2.5) < 1.3)
+        grain = np.mean([np.sin(a * across + b * z + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9))], axis=0)
+        shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * grain
+        shade = np.where(wall & (y < -6), 0.92, shade / (1 + depth / 300))  # sky above the walls
+        views.append(np.repeat(np.rint(255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=2))
+    return views

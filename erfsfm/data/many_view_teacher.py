@@ -13,7 +13,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -26,7 +26,6 @@ from erfsfm.common.errors import DataError, TrainingError
 from erfsfm.common.files import FolderLock, write_array, write_atomically
 from erfsfm.common.processes import limit_library_threads, processes, slam_process
 from erfsfm.common.progress import Progress
-from erfsfm.common.readers.camera_file import Pinhole
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import ArrayCache, TeacherStructure, snippet_motion
@@ -40,6 +39,10 @@ VERSION = 4
 LARGEST_WIDTH = 800
 FINER = 2  # learned depth is refined at this many times the labels' size, where images have as many pixels
 LEAST_NEIGHBOURS = 2
+_FPS = 10.0
+_CAMERA_HEIGHT_M = 1.65  # any: poses are given in camera heights
+_TRAJECTORY = "trajectory_optimised.kitti.txt"
+_SETTINGS = ("mapping.enabled=false", "output.report=false")
 _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
 
@@ -100,13 +103,31 @@ class DriveLabels:
             raise TrainingError(f"the teacher's label {path} is damaged: delete it, start again ({error})") from error
 
     def measure_poses(self, weights: str) -> None:
-        """Run the SLAM system on the drive and keep its poses."""
-        recording, video = self.recording, self.recording.video
-        images: Iterable[Path | NDArray[np.uint8]] = recording.images
-        if video is not None:  # in order and at full size, which `Video` is not made for
-            frames = VideoFrames(video.path, counted_frames=0)
-            images = (frames.read(recording.start + index) for index in range(len(recording)))
-        T_world_camera = drive_poses(recording.frames_name, images, recording.camera, weights)
+        """Run the SLAM system on the drive and keep its poses; ``TrainingError`` without a trajectory or a scale."""
+        recording, name = self.recording, self.recording.frames_name
+        with tempfile.TemporaryDirectory(prefix="erfsfm-teacher-") as temporary:
+            drive, output = Path(temporary) / "drive", Path(temporary) / "run"
+            drive.mkdir()
+            if recording.video is None:
+                for index, path in enumerate(recording.images):
+                    (drive / f"{index:06d}{path.suffix}").symlink_to(path.resolve())
+            else:  # in order and at full size, which `Video` is not made for
+                frames = VideoFrames(recording.video.path, counted_frames=0)
+                for index in range(len(recording)):
+                    cv2.imwrite(str(drive / f"{index:06d}.png"), frames.read(recording.start + index)[..., ::-1])
+            camera = asdict(recording.camera) | {"fps": _FPS, "camera_height_m": _CAMERA_HEIGHT_M}
+            (drive / "camera.yaml").write_text(yaml.safe_dump(camera))
+            words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights, "--device", "cpu"]
+            reason = slam_process([*words, *(word for setting in _SETTINGS for word in ("--set", setting))])
+            if reason or not (output / _TRAJECTORY).is_file():
+                raise TrainingError(f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}")
+            rows = np.loadtxt(output / _TRAJECTORY).reshape(-1, 3, 4)
+            mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
+        if mode != "camera-height":
+            raise TrainingError(f"the teacher's poses of {name} have no scale: no road was found (scale mode {mode})")
+        T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
+        T_world_camera[:, :3] = rows
+        T_world_camera[:, :3, 3] /= _CAMERA_HEIGHT_M
         write_atomically(self.weights_file, weights)
         self.keep_poses(T_world_camera)
 
@@ -152,7 +173,8 @@ class DriveLabels:
         else:
             finer = FINER if camera.width > 1.5 * width else 1
             camera = camera.resized(finer * width, finer * height)
-        image, around = self._image(target, camera), self._around(target, camera)
+        before_and_after = [target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording)]
+        image, around = self._image(target, camera), self._greys(before_and_after, camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
         grey, K, motion = _grey(image), camera.K.astype(np.float64), self._motion(target, around)
@@ -168,10 +190,6 @@ class DriveLabels:
         if not others:
             return None
         return shrunk(*refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth), finer)
-
-    def _around(self, target: int, camera: Camera) -> dict[int, Grey]:
-        """Frames before and after."""
-        return self._greys([target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording)], camera)
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
@@ -250,7 +268,10 @@ class ManyViewTeacher:
             for drive in drives:
                 drive.require_weights(weights)
             without = [drive for drive in drives if not drive.poses_file.is_file()]
-            tasks = [each for drive in drives for each in _missing(drive, sources)] if self._with_depth else []
+            tasks: list[tuple[DriveLabels, list[int]]] = []
+            for drive in drives if self._with_depth else ():
+                missing = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
+                tasks += [(drive, missing[first : first + _CHUNK]) for first in range(0, len(missing), _CHUNK)]
             for drive in (*without, *(drive for drive, _ in tasks)):
                 if drive.compact:
                     raise TrainingError(
@@ -278,12 +299,6 @@ def _digest(recording: Recording) -> str:
     seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
     seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
     return hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
-
-
-def _missing(drive: DriveLabels, sources: int) -> list[tuple[DriveLabels, list[int]]]:
-    """Frames without a label yet, in portions."""
-    frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
-    return [(drive, frames[first : first + _CHUNK]) for first in range(0, len(frames), _CHUNK)]
 
 
 def _grey(image: NDArray[np.uint8]) -> Grey:
@@ -339,48 +354,3 @@ def _continued(code: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.
     """Unknown pixels with the code of the known pixel left of them: small when compressed."""
     columns = np.where(known, np.arange(code.shape[1]), 0)
     return np.asarray(np.take_along_axis(code, np.maximum.accumulate(columns, axis=1), axis=1))
-
-
-FPS = 10.0
-CAMERA_HEIGHT_M = 1.65  # any: poses are given in camera heights
-TRAJECTORY = "trajectory_optimised.kitti.txt"
-SETTINGS = ("mapping.enabled=false", "output.report=false")
-
-
-def drive_poses(
-    name: str, images: Iterable[Path | NDArray[np.uint8]], camera: Pinhole, weights: str
-) -> NDArray[np.float64]:
-    """Run the SLAM system on a drive; ``TrainingError`` where it gives no trajectory or no scale.
-
-    Args:
-        name: of the drive, for errors.
-        images: of every frame, files or RGB ``(H, W, 3)``.
-        camera: of the images.
-        weights: of the networks that the system uses.
-
-    Returns:
-        ``T_world_camera`` ``(N, 4, 4)``, translations in heights of the camera over the road.
-    """
-    with tempfile.TemporaryDirectory(prefix="erfsfm-teacher-") as temporary:
-        drive, output = Path(temporary) / "drive", Path(temporary) / "run"
-        drive.mkdir()
-        for index, image in enumerate(images):
-            place = drive / f"{index:06d}.png"
-            if isinstance(image, Path):
-                place.with_suffix(image.suffix).symlink_to(image.resolve())
-            else:
-                cv2.imwrite(str(place), image[..., ::-1])
-        numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-        (drive / "camera.yaml").write_text(yaml.safe_dump(numbers | {"fps": FPS, "camera_height_m": CAMERA_HEIGHT_M}))
-        words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights, "--device", "cpu"]
-        reason = slam_process([*words, *(word for setting in SETTINGS for word in ("--set", setting))])
-        if reason or not (output / TRAJECTORY).is_file():
-            raise TrainingError(f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}")
-        rows = np.loadtxt(output / TRAJECTORY).reshape(-1, 3, 4)
-        mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
-    if mode != "camera-height":
-        raise TrainingError(f"the teacher's poses of {name} have no scale: no road was found (scale mode {mode})")
-    T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_world_camera[:, :3] = rows
-    T_world_camera[:, :3, 3] /= CAMERA_HEIGHT_M
-    return T_world_camera

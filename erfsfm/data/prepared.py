@@ -99,8 +99,17 @@ def write_prepared(
             elif teacher is not None:
                 _write_labels(teacher.drive(recording), folder / _LABELS, network)
         report_unreadable(unreadable, sum(map(len, recordings)), "images")
-        entries = _Index(recordings=[_entry(recording, network) for recording in recordings])
-        (unfinished / INDEX_FILE).write_text(dump_yaml(entries))
+        entries = [
+            _Entry(
+                name=recording.name,
+                start=recording.start,
+                frames=len(recording),
+                camera=recording.camera.resized(network.width, network.height, network.fidelity),
+                camera_height_m=recording.camera_height_m,
+            )
+            for recording in recordings
+        ]
+        (unfinished / INDEX_FILE).write_text(dump_yaml(_Index(recordings=entries)))
         unfinished.replace(output)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -121,16 +130,6 @@ def _recording(folder: Path, entry: _Entry) -> Recording:
         stored=entry.frames,
         without_stops=True,
         labels=folder / _LABELS,
-    )
-
-
-def _entry(recording: Recording, network: NetworkConfig) -> _Entry:
-    return _Entry(
-        name=recording.name,
-        start=recording.start,
-        frames=len(recording),
-        camera=recording.camera.resized(network.width, network.height, network.fidelity),
-        camera_height_m=recording.camera_height_m,
     )
 
 

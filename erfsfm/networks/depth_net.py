@@ -139,7 +139,8 @@ class DepthNet(DisparityNetwork):
             if reference is not image:
                 parts.append(reference)
             if disparities:
-                parts.append(crop_like(_double(disparities[0]), reference))
+                coarser = F.interpolate(disparities[0], scale_factor=2, mode="bilinear", align_corners=False)
+                parts.append(crop_like(coarser, reference))
             features = iconv(torch.cat(parts, dim=1))
             head = level - len(self.upconvs) + _SCALES
             if head >= 0:
@@ -151,7 +152,3 @@ def _stage_layers(stage: int, kernel: int, variant: Variant) -> tuple[Layer, Lay
     dilation = 2 if variant == "dilated" and stage in _DILATED_STAGES else 1
     deformable = stage in _DEFORMABLE_STAGES.get(variant, ())
     return Layer(kernel, 2, dilation, deformable), Layer(kernel, 1, dilation, deformable)
-
-
-def _double(disparity: Tensor) -> Tensor:
-    return F.interpolate(disparity, scale_factor=2, mode="bilinear", align_corners=False)

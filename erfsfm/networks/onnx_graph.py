@@ -124,13 +124,9 @@ def keep(made_from: str, graph: bytes) -> None:
 
 
 def _path(made_from: str) -> Path:
-    torch_version = importlib.metadata.version("torch")
-    return folder() / f"{hashlib.sha256(f'{made_from} {torch_version} {_code()}'.encode()).hexdigest()}.onnx"
-
-
-def _code() -> str:
-    """Digest of the files from which graphs are made: networks and their geometry."""
+    """By the files, too, from which graphs are made: networks and their geometry."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
+    digest.update(f"{made_from} {importlib.metadata.version('torch')}".encode())
     for file in sorted([*package.glob("networks/*.py"), package / "geometry.py"]):
         digest.update(file.read_bytes())
-    return digest.hexdigest()
+    return folder() / f"{digest.hexdigest()}.onnx"

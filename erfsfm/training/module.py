@@ -49,7 +49,7 @@ class SelfSupervision(lightning.LightningModule):
         self.depth_net.requires_grad_(config.training.networks != "pose")
         self.pose_net.requires_grad_(config.training.networks != "depth")
         if isinstance(self.depth_net, Lite0DepthNet):
-            self.depth_net.encoder.freeze(config.training.frozen_stages)
+            self.depth_net.encoder.stages[: config.training.frozen_stages].requires_grad_(False)  # the stem being one
             # depthwise convolutions are a quarter faster so
             self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.train()  # Lightning keeps the mode of each module

@@ -80,7 +80,9 @@ def main() -> None:
         licence=record.licence,
         note=arguments.note,
         evaluation=arguments.evaluation,
-        metrics=_table(arguments.metrics, record.metrics),
+        metrics=table_of(
+            json.loads(arguments.metrics.read_text()) if arguments.metrics else [record.metrics]
+        ).markdown(),
     )
     (folder / "README.md").write_text(card)
     print(f"{folder}: read {folder / 'README.md'}")
@@ -98,11 +100,6 @@ def averaged(models: list[Model]) -> Model:
         network.load_state_dict(mean)
     seen = merge([name for each in models for name in each.record.trained_on])
     return Model(model.record.model_copy(update={"trained_on": seen}), model.networks)
-
-
-def _table(path: Path | None, fallback: dict[str, float]) -> str:
-    rows = json.loads(path.read_text()) if path else [fallback]
-    return table_of(rows).markdown()
 
 
 if __name__ == "__main__":

@@ -67,6 +67,7 @@ def main() -> None:
                 f"{file.name} has {size:.1f} MB; shipped weights have at most {LARGEST_MB}: train narrower"
             )
     network = record.network
+    measured = json.loads(arguments.metrics.read_text()) if arguments.metrics else [record.metrics]
     card = CARD.format(
         name=arguments.name,
         **network.model_dump(),
@@ -80,9 +81,7 @@ def main() -> None:
         licence=record.licence,
         note=arguments.note,
         evaluation=arguments.evaluation,
-        metrics=table_of(
-            json.loads(arguments.metrics.read_text()) if arguments.metrics else [record.metrics]
-        ).markdown(),
+        metrics=table_of(measured).markdown(),
     )
     (folder / "README.md").write_text(card)
     print(f"{folder}: read {folder / 'README.md'}")

@@ -168,7 +168,13 @@ def _row(
     size = (height, width)
     pushed = offsets_px if any(layer.deformable for layer in probe.encoder.layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
-    network, weights = _with_weights(name, fidelity, learned)
+    network, weights = build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
+    if learned is not None:  # where they are of this preset
+        title, model = learned
+        config, kind = model.record.network, PRESETS[name].kind
+        trained = model.networks.get(kind)
+        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
+            network, weights = trained, title
     weighed = field_of(network.encoder.eval().to(device), _encoder_input(snippet, network).to(device))
     summary = {
         "name": name,
@@ -185,17 +191,6 @@ def _row(
     }
     title = f"{name} (paper)" if fidelity == "paper" else name
     return FieldRow(title, summary, theoretical_corner(probe, seen.pixel, pushed), seen, weighed)
-
-
-def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | None) -> tuple[Network, str]:
-    """The learned network if it is of this preset, else a fresh one."""
-    if learned is not None:
-        title, model = learned
-        config, kind = model.record.network, PRESETS[name].kind
-        trained = model.networks.get(kind)
-        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
-            return trained, title
-    return build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
 
 
 def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Tensor:

@@ -20,6 +20,7 @@ from pydantic import Field
 
 from erfsfm.common.config_tree import Section, dump_yaml, read_model
 from erfsfm.common.errors import DataError
+from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import NetworkConfig
@@ -95,7 +96,7 @@ def write_prepared(
                 for index in range(len(recording)):
                     depth = np.rint(recording.shrunk_depth(index, network.height, network.width) * 256)
                     path = _file(folder, "depth", recording.start + index)
-                    _put(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]))
+                    write_atomically(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]), sync=False)
             elif teacher is not None:
                 _write_labels(teacher.drive(recording), folder / _LABELS, network)
         report_unreadable(unreadable, sum(map(len, recordings)), "images")
@@ -142,7 +143,7 @@ def _write_images(folder: Path, recording: Recording, network: NetworkConfig) ->
         except DataError as error:
             return str(error)
         jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-        _put(_file(folder, "images", recording.start + index), bytes(jpeg))
+        write_atomically(_file(folder, "images", recording.start + index), bytes(jpeg), sync=False)
         return ""
 
     one_by_one = recording.video is not None  # a video is decoded in order
@@ -154,7 +155,7 @@ def _write_truth(folder: Path, snippet: Recording, middle: int) -> None:
     """Write what is known of a snippet to validate on: depth of its middle frame, as it is stored, and poses."""
     depth = snippet.depth[middle] if snippet.depth else None
     if depth is not None:
-        _put(_file(folder, "depth", snippet.start + middle), depth.read_bytes())
+        write_atomically(_file(folder, "depth", snippet.start + middle), depth.read_bytes(), sync=False)
     T_world_camera = snippet.true_poses()
     if T_world_camera is not None:
         np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
@@ -168,9 +169,4 @@ def _write_labels(measured: DriveLabels, folder: Path, network: NetworkConfig) -
         shutil.copyfile(measured.weights_file, kept.weights_file)
     for target in measured.targets(network.sources):
         if measured.label_file(target).is_file():
-            _put(kept.label_file(target), encode(*measured.label(target)))
-
-
-def _put(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+            write_atomically(kept.label_file(target), encode(*measured.label(target)), sync=False)

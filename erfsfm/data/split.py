@@ -202,23 +202,22 @@ def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> 
 
 def _without_stops(recordings: list[Recording]) -> list[Recording]:
     """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
-    kept = [part for recording in recordings for part in _moving(recording)]
+    kept: list[Recording] = []
+    for recording in recordings:
+        kind, _, _ = recording.name.partition("/")
+        if recording.without_stops or kind not in ("kitti_raw", "folder") or recording.exact:
+            kept.append(recording)
+        elif kind == "kitti_raw":
+            kept += moving_parts(recording)
+        else:  # a doubled frame of an own video is no stop, and its drive stays whole for the teacher
+            shortest = min(_SHORTEST_END, len(recording))
+            kept += [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= shortest]
     before = sum(map(len, recordings))
     if (lost := before - sum(map(len, kept))) > 0:
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)
     if recordings and not kept:
         raise DataError("the camera stands still in every frame found: nothing can be learned from them")
     return kept
-
-
-def _moving(recording: Recording) -> list[Recording]:
-    """A doubled frame of an own video is no stop, and its drive stays whole for the teacher."""
-    kind, _, _ = recording.name.partition("/")
-    if recording.without_stops or kind not in ("kitti_raw", "folder") or recording.exact:
-        return [recording]
-    if kind == "kitti_raw":
-        return moving_parts(recording)
-    return [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= min(_SHORTEST_END, len(recording))]
 
 
 STILL_M_S = 0.5  # 5 cm a frame

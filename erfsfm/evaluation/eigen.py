@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,13 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
         split: ``eigen``, a file of the list ``test``, or any other file with a frame a line.
         root: of KITTI raw: the folder of the dates, a date, or a drive.
     """
-    base = _root_of_dates(root)
+    if not root.is_dir():
+        raise DataError(f"no data set at {root}: wanted the folder that holds KITTI's dates (2011_09_26, ...)")
+    base = root.resolve()
+    if base.name.endswith("_sync"):
+        base = base.parents[1]
+    elif (base / "calib_cam_to_cam.txt").is_file():
+        base = base.parent
     path = Path(split)
     if path.is_file() and path.suffix not in (".yaml", ".yml"):
         try:
@@ -86,6 +93,7 @@ def eigen_protocol(
     Raises:
         DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
     """
+    compare = partial(depth_errors, cap_m=CAP_M, crop="garg", clipping="before" if fidelity == "paper" else "after")
     frames = read_split(split, root)
     leak = refuse_leak(networks, [frame.name for frame in frames], allow_leak)
     errors: dict[str, list[DepthErrors]] = {"gt-median": [], "pose": []}
@@ -94,28 +102,18 @@ def eigen_protocol(
         image = read_image(frame.image_path())
         truth = lidar_depth(frame, image.shape[:2], fidelity)
         guess = _depth(networks, image, fidelity)
-        found = _compare(guess, truth, "median", fidelity)
+        found = compare(guess, truth)
         if found is None:
             raise DataError(f"the LiDAR of {frame.name} hits nothing under {CAP_M:g} m in the crop")
         errors["gt-median"].append(found)
-        road = _compare(flat_road_depth(frame, image.shape[:2], _FLAT_ROAD_M), truth, "median", fidelity)
+        road = compare(flat_road_depth(frame, image.shape[:2], _FLAT_ROAD_M), truth)
         flat += [road] if road is not None else []
         scale = _scale_of_motion(networks, frame, fidelity)
-        by_motion = _compare(guess, truth, scale, fidelity) if scale is not None else None
+        by_motion = compare(guess, truth, scaling=scale) if scale is not None else None
         if by_motion is not None:
             errors["pose"].append(by_motion)
     rows = [_row("networks", scaling, found, len(frames), leak) for scaling, found in errors.items()]
     return [*rows, _row("flat road", "gt-median", flat, len(frames), leak=False)]
-
-
-def _root_of_dates(root: Path) -> Path:
-    """The folder of the dates, given it, a date or a drive."""
-    if not root.is_dir():
-        raise DataError(f"no data set at {root}: wanted the folder that holds KITTI's dates (2011_09_26, ...)")
-    root = root.resolve()
-    if root.name.endswith("_sync"):
-        return root.parents[1]
-    return root.parent if (root / "calib_cam_to_cam.txt").is_file() else root
 
 
 def _depth(networks: DepthPosePredictor, image: NDArray[np.uint8], fidelity: Fidelity) -> NDArray[np.float32]:
@@ -126,13 +124,6 @@ def _depth(networks: DepthPosePredictor, image: NDArray[np.uint8], fidelity: Fid
     depth = networks.depth(resize_image(image, size.height, size.width))
     height, width = image.shape[:2]
     return np.asarray(zoom(depth, (height / depth.shape[0], width / depth.shape[1]), order=3), dtype=np.float32)
-
-
-def _compare(
-    guess: NDArray[np.float32], truth: NDArray[np.float32], scaling: float | Any, fidelity: Fidelity
-) -> DepthErrors | None:
-    clipping: Any = "before" if fidelity == "paper" else "after"
-    return depth_errors(guess, truth, CAP_M, crop="garg", scaling=scaling, clipping=clipping)
 
 
 def _scale_of_motion(networks: DepthPosePredictor, frame: RawFrame, fidelity: Fidelity) -> float | None:

@@ -173,7 +173,11 @@ class SelfSupervision(lightning.LightningModule):
             self._note_poses(T_source_target, batch.get("T_source_target"))
         if disparity is not None and T_source_target is not None:
             with torch.autocast(self.device.type, enabled=False):
-                self._note("photometric", _reconstruction_error(batch, disparity, T_source_target))
+                # the smallest error among the sources (0.85 SSIM), whatever the training loss is
+                level = Level(batch["target"], batch["sources"], batch["K"], disparity)
+                errors, valid = level.errors(T_source_target, 0.85)
+                error = errors.masked_fill(~valid, torch.inf).amin(dim=1)
+                self._note("photometric", float(error[torch.isfinite(error)].mean()))
 
     def _note_depth(self, disparity: Tensor, true_depth: Tensor | None) -> None:
         self._note("disparity_spread", float(disparity.std() / disparity.mean()))
@@ -241,10 +245,3 @@ def learning_rate_factor(schedule: str, progress: float, step: int = _WARM_UP) -
         risen = min(max((step + 1) / _WARM_UP, 20 * progress), 1)
         return risen * (0.51 + 0.49 * math.cos(math.pi * progress))
     return 0.1 if schedule == "step" and progress >= 0.75 else 1.0
-
-
-def _reconstruction_error(batch: dict[str, Tensor], disparity: Tensor, T_source_target: Tensor) -> float:
-    """Mean over pixels of the smallest error among the sources (0.85 SSIM), whatever the training loss is."""
-    errors, valid = Level(batch["target"], batch["sources"], batch["K"], disparity).errors(T_source_target, 0.85)
-    error = errors.masked_fill(~valid, torch.inf).amin(dim=1)
-    return float(error[torch.isfinite(error)].mean())

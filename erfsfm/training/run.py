@@ -32,7 +32,7 @@ from erfsfm.common.processes import opencv_threads
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
-from erfsfm.config import UNTRAINED, ExperimentConfig, Precision, dump_yaml
+from erfsfm.config import UNTRAINED, ExperimentConfig, dump_yaml
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
@@ -249,7 +249,12 @@ def _trainer(
 ) -> lightning.Trainer:
     training = config.training
     on_cpu = choose_device(device) == "cpu"
-    precision = _precision_on_cpu(training.precision) if on_cpu else training.precision
+    precision = training.precision
+    if on_cpu and precision != "32-true":
+        precision = "bf16-mixed" if has_bfloat16() else "32-true"
+        if precision != training.precision:
+            said = "training.precision %s does not fit this processor: %s is used"
+            logger.warning(said, training.precision, precision)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     latest = ModelCheckpoint(
         output / "checkpoints",
@@ -284,15 +289,6 @@ def _trainer(
         enable_model_summary=False,
         default_root_dir=output,
     )
-
-
-def _precision_on_cpu(wanted: Precision) -> Precision:
-    """What the processor computes with."""
-    fitting: Precision = "bf16-mixed" if has_bfloat16() else "32-true"
-    if wanted in ("32-true", fitting):
-        return wanted
-    logger.warning("training.precision %s does not fit this processor: %s is used", wanted, fitting)
-    return fitting
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

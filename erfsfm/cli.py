@@ -7,6 +7,7 @@ import logging
 import math
 import shlex
 import sys
+import tempfile
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -171,8 +172,9 @@ def evaluate_depth(
 
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
+    from erfsfm.data.discovery import discover
     from erfsfm.evaluation.eigen import eigen_protocol
-    from erfsfm.evaluation.protocols import depth_protocol, many_view_protocol
+    from erfsfm.evaluation.protocols import depth_protocol, many_view_protocol, named_recordings
     from erfsfm.inference import DepthPosePredictor
 
     if truth == "many-views" and split is not None:
@@ -187,7 +189,11 @@ def evaluate_depth(
     networks = {name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)}
     with progress_bar() as show:
         if truth == "many-views":
-            rows = many_view_protocol(networks["networks"], dataset[0], sequence or (), cache, allow_leak, show)
+            recordings = [part for name in sequence or () for part in named_recordings(dataset[0], name)]
+            recordings = recordings or discover(dataset[0])
+            with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:
+                kept = cache or Path(folder)
+                rows = many_view_protocol(networks["networks"], recordings, kept, allow_leak, show)
         elif split is None:
             rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
         else:
@@ -258,7 +264,7 @@ def predict(
     import cv2
     import numpy as np
 
-    from erfsfm.common.files import write_array, write_atomically
+    from erfsfm.common.files import write_atomically
     from erfsfm.common.readers.images import list_images, read_image, report_unreadable
     from erfsfm.inference import DepthPosePredictor, colour_disparity
 
@@ -285,7 +291,7 @@ def predict(
             continue
         output.mkdir(parents=True, exist_ok=True)
         depth = predictor.depth(image)
-        write_array(depth_file, partial(np.save, arr=depth))
+        write_atomically(depth_file, partial(np.save, arr=depth))
         picture = cv2.imencode(".png", colour_disparity(depth)[..., ::-1])[1]
         write_atomically(depth_file.with_suffix(".png"), bytes(picture))
     report_unreadable(unreadable, len(files), "images")

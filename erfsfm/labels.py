@@ -51,7 +51,7 @@ def label(
     plane = None if forward is None else road_plane(inverse_depth, reliable, p, forward)
     if plane is not None:
         road = (p @ plane).astype(np.float32)
-        at_least = impose_road(inverse_depth, sigma, reliable, road, ~reliable)
+        at_least = impose_road(inverse_depth, sigma, reliable, road)
     sigma = np.maximum(sigma, LEAST_SIGMA * np.abs(inverse_depth))
     least = np.maximum(np.where(np.isfinite(sigma), inverse_depth - sigma, 0), at_least)
     most = np.where(np.isfinite(sigma), np.maximum(inverse_depth, 0) + sigma, np.inf)
@@ -249,16 +249,14 @@ def impose_road(
     sigma: Array,
     reliable: NDArray[np.bool_],
     road: Array,
-    fillable: NDArray[np.bool_] | bool = True,
 ) -> Array:
-    """Forget what lies under the road and put the road's own depth where a pixel lies on it, both in place.
+    """Forget what lies under the road and put the road's own depth where an unknown pixel lies on it, both in place.
 
     Args:
         inverse_depth: ``(H, W)``.
         sigma: of the inverse depth, ``(H, W)``; infinite afterwards where a pixel is under the road.
         reliable: where the inverse depth may be used, ``(H, W)``.
         road: inverse depth of the road at every pixel, ``(H, W)``, not positive above the horizon.
-        fillable: where the road may replace a measurement, ``(H, W)``.
 
     Returns:
         Smallest possible inverse depth ``(H, W)``: that of the road, less its tolerance, of pixels under it; else 0.
@@ -266,7 +264,7 @@ def impose_road(
     at_least = np.zeros_like(inverse_depth)
     under = under_road(inverse_depth, sigma, road)
     sigma[under], at_least[under] = np.inf, (1 - NEAR) * road[under]
-    level = on_road(inverse_depth, reliable, road) & ~under & fillable
+    level = on_road(inverse_depth, reliable, road) & ~under & ~reliable
     inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
     return at_least
 

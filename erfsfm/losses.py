@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -37,10 +37,7 @@ def _box(x: Tensor) -> Tensor:
     return box.mul_(1 / 9)
 
 
-def box_mean(x: Tensor) -> Tensor:
-    """Mean over each 3 x 3 window of ``(..., H, W)``, without padding."""
-    mean: Tensor = BoxMean.apply(x)  # type: ignore[no-untyped-call]
-    return mean
+box_mean: Callable[[Tensor], Tensor] = BoxMean.apply  # over each 3 x 3 window of ``(..., H, W)``, without padding
 
 
 def dissimilarity(first: Tensor, second: Tensor) -> Tensor:
@@ -125,17 +122,8 @@ LEAST_HALF_WIDTH = 1e-3  # of bounds, log inverse depth: those of exact depth ha
 STILL = 0.01  # network units: added to the length of a step, against division by zero
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds of the inverse depth of each pixel, as measured.
-
-    Attributes:
-        least: ``(B, 1, H, W)``, 0 where nothing bounds it from below.
-        most: ``(B, 1, H, W)``, infinite where nothing bounds it from above.
-    """
-
-    least: Tensor
-    most: Tensor
+Bounds = tuple[Tensor, Tensor]
+"""Least and most inverse depth ``(B, 1, H, W)`` as measured: 0 where unbounded from below, infinite from above."""
 
 
 def enlarged(disparity: Tensor, level: int, size: tuple[int, int]) -> Tensor:
@@ -162,16 +150,16 @@ def disagreement(disparity: Tensor, bounds: Bounds, log_scale: float) -> Tensor:
         bounds: of the same size.
         log_scale: log of the disparity's scale over that of the bounds.
     """
-    has_most, has_least = torch.isfinite(bounds.most), bounds.least > 0
+    has_least, has_most = bounds[0] > 0, torch.isfinite(bounds[1])
     scaled = disparity.log() - log_scale
-    least, most = (bound.clamp(min=1e-6).log() for bound in (bounds.least, bounds.most))
+    least, most = (bound.clamp(min=1e-6).log() for bound in bounds)
     both = has_least & has_most
     middle = torch.where(both, (least + most) / 2, 0)
     half = torch.where(both, (most - least) / 2, 1).clamp(min=LEAST_HALF_WIDTH)
     apart = (scaled - middle).abs()
     huber = torch.where(apart < half, apart.square() / (2 * half), apart - half / 2)
     one_sided = (least - scaled).clamp(min=0) * has_least + (scaled - most).clamp(min=0)
-    nearest = torch.where(has_most, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
+    nearest = torch.where(has_most, bounds[1], bounds[0]).clamp(min=1 / FARTHEST)
     counts = both | (one_sided.detach() > 0)
     weight = torch.where(counts, nearest.rsqrt(), 0)
     mean: Tensor = (weight * torch.where(both, huber, one_sided)).sum() / weight.sum().clamp(min=1)
@@ -187,8 +175,9 @@ def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
         disparity: inverse depth ``(B, 1, H, W)``, positive, at any scale.
         bounds: of the same size.
     """
-    narrow = (bounds.least > 0) & (bounds.most < MAX_BOUND_RATIO * bounds.least)
-    middle = torch.where(narrow, (bounds.least * bounds.most).sqrt(), 1)
+    least, most = bounds
+    narrow = (least > 0) & (most < MAX_BOUND_RATIO * least)
+    middle = torch.where(narrow, (least * most).sqrt(), 1)
     error = torch.where(narrow, disparity.log() - middle.log(), 0)
     total = disparity.new_zeros(())
     for apart in STEPS_PX:

@@ -278,8 +278,3 @@ def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[
 def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
     """Colour as uint8, ``(N + 1, 3, H, W)``."""
     return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
-
-
-def in_unit_range(batch: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of a batch with colour in [0, 1]; samples hold it as uint8, a quarter of the bytes to hand over."""
-    return {name: each.float() / 255 if each.dtype == torch.uint8 else each for name, each in batch.items()}

@@ -23,7 +23,7 @@ import yaml
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
-from erfsfm.common.files import FolderLock, write_array, write_atomically
+from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.processes import limit_library_threads, processes, slam_process
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
@@ -143,7 +143,7 @@ class DriveLabels:
 
     def keep_poses(self, T_world_camera: NDArray[np.float64]) -> None:
         """Write the poses ``(N, 4, 4)`` of all frames."""
-        write_array(self.poses_file, partial(np.save, arr=T_world_camera))
+        write_atomically(self.poses_file, partial(np.save, arr=T_world_camera))
 
     def measure_labels(self, targets: Sequence[int], learned: Learned | None = None) -> int:
         """Measure and keep the labels of some frames; returns their number.
@@ -161,7 +161,7 @@ class DriveLabels:
                 for values in bounds
             )
             arrays = {"least": least, "most": most}
-            write_array(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
+            write_atomically(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
         return len(targets)
 
     def _bounds(self, target: int, learned: Learned | None) -> Bounds | None:
@@ -263,7 +263,7 @@ class ManyViewTeacher:
         labels in a prepared folder.
         """
         with FolderLock() as lock:
-            lock.wait_for(self._folder)
+            lock.take(self._folder, waits=True)
             drives = [self.drive(recording) for recording in recordings]
             for drive in drives:
                 drive.require_weights(weights)

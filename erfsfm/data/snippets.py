@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.augmentation import as_tensors, depth_alone, single_image, training_sample
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
@@ -27,7 +28,6 @@ from erfsfm.data.window import (
     TeacherStructure,
     first_readable,
     load_window,
-    readable,
     snippet_motion,
 )
 from erfsfm.geometry import Camera
@@ -151,7 +151,14 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         kept = usable(recordings, length)
         windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
         chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
-        self.snippets = readable([windows[int(i)] for i in chosen.round()], self._read)
+        self.snippets, reasons = [], []
+        for snippet in (windows[int(i)] for i in chosen.round()):
+            try:
+                self._read(snippet)
+                self.snippets.append(snippet)
+            except DataError as error:
+                reasons.append(str(error))
+        report_unreadable(reasons, len(chosen), "snippets to validate on")
 
     def __len__(self) -> int:
         return len(self.snippets)

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import report_unreadable
 from erfsfm.data.recordings import Recording
 
 logger = logging.getLogger(__name__)
@@ -84,19 +83,6 @@ def first_readable(snippets: Iterator[Snippet], read: Callable[[Snippet], T], na
                 more = "; more files are not named" if len(named) == _MOST_NAMED else ""
                 logger.warning("%s: snippets with it are passed over%s", reason, more)
     raise DataError(f"{_MOST_IN_A_ROW} snippets in a row cannot be read, the last: {reason}")
-
-
-def readable(snippets: list[Snippet], read: Callable[[Snippet], object]) -> list[Snippet]:
-    """The snippets that can be read; of the others one warning, and ``DataError`` where none can."""
-    kept, reasons = [], []
-    for snippet in snippets:
-        try:
-            read(snippet)
-            kept.append(snippet)
-        except DataError as error:
-            reasons.append(str(error))
-    report_unreadable(reasons, len(snippets), "snippets to validate on")
-    return kept
 
 
 _BLOCK = 128  # arrays

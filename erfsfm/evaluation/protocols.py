@@ -6,7 +6,6 @@ On other drives static surfaces are measured from neighbouring frames at a run's
 
 from __future__ import annotations
 
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -223,12 +222,7 @@ _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: th
 
 
 def many_view_protocol(
-    networks: DepthPosePredictor,
-    root: Path,
-    sequences: Sequence[str],
-    cache: Path | None,
-    allow_leak: bool,
-    progress: Progress,
+    networks: DepthPosePredictor, recordings: Sequence[Recording], cache: Path, allow_leak: bool, progress: Progress
 ) -> list[dict[str, Any]]:
     """Median-scaled depth errors where the many-view teacher knows the depth within ``LARGEST_RATIO``.
 
@@ -237,9 +231,8 @@ def many_view_protocol(
 
     Args:
         networks: to evaluate.
-        root: of a data set.
-        sequences: recordings of it, or frames of one (``00[250:300]``); all where none is named.
-        cache: receives poses and depth, for the next call; forgotten where None.
+        recordings: whole drives, or parts of them.
+        cache: receives poses and depth, for the next call.
         allow_leak: evaluate also frames that the networks were trained on.
         progress: told of the stage, what is done, and of how many.
 
@@ -247,18 +240,9 @@ def many_view_protocol(
         One row for each recording; ``known`` is the share of pixels that were compared.
 
     Raises:
-        DataError: no such recording, a leak that was not allowed, or no depth could be measured.
+        DataError: a leak that was not allowed, or no depth could be measured.
         TrainingError: a recording gives no trajectory or no scale.
     """
-    recordings = [each for name in sequences for each in named_recordings(root, name)] or discover(root)
-    with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:
-        return many_view_errors(networks, recordings, cache or Path(folder), allow_leak, progress)
-
-
-def many_view_errors(
-    networks: DepthPosePredictor, recordings: Sequence[Recording], cache: Path, allow_leak: bool, progress: Progress
-) -> list[dict[str, Any]]:
-    """`many_view_protocol` of recordings."""
     leaks = [refuse_leak(networks, [each.frames_name], allow_leak) for each in recordings]
     rows = []
     for recording, leak in zip(recordings, leaks):
@@ -267,7 +251,16 @@ def many_view_errors(
         # the teacher's labels are measured around a network's depth, and truth without any
         teacher = ManyViewTeacher(cache / TRUTH_FOLDER, (round(height * ratio), round(width * ratio)), EVERY)
         teacher.prepare([recording], networks.sources, SLAM_WEIGHTS, progress)
-        errors, known = _compare(networks, recording, teacher)
+        drive, errors, known = teacher.drive(recording), [], []
+        for target in drive.targets(networks.sources):
+            low, high = (bound.astype(np.float32) for bound in drive.label(target))
+            narrow = (low > 0) & (high < LARGEST_RATIO * low)
+            truth = np.zeros_like(low)  # where the bounds are too far apart
+            truth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
+            error = depth_errors(networks.depth(recording.image(target, *truth.shape)), truth, CAP_HEIGHTS)
+            if error is not None:
+                errors.append(error)
+                known.append(float(np.mean((truth > 0) & (truth < CAP_HEIGHTS))))
         if not errors:
             raise DataError(f"no depth could be measured in {recording.frames_name}: the camera has to travel")
         mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
@@ -275,31 +268,6 @@ def many_view_errors(
         row |= {"scale_spread": float(scales.std() / scales.mean()), "known": float(np.mean(known))}
         rows.append(row | {"images": len(errors), "leak": leak})
     return rows
-
-
-def _compare(
-    networks: DepthPosePredictor, recording: Recording, teacher: ManyViewTeacher
-) -> tuple[list[DepthErrors], list[float]]:
-    """Errors, and the share of known pixels, of each frame that has any."""
-    drive = teacher.drive(recording)
-    errors, known = [], []
-    for target in drive.targets(networks.sources):
-        truth = _depth(*drive.label(target))
-        guess = networks.depth(recording.image(target, *truth.shape))
-        found = depth_errors(guess, truth, CAP_HEIGHTS)
-        if found is not None:
-            errors.append(found)
-            known.append(float(np.mean((truth > 0) & (truth < CAP_HEIGHTS))))
-    return errors, known
-
-
-def _depth(least: NDArray[np.float16], most: NDArray[np.float16]) -> NDArray[np.float32]:
-    """Depth ``(H, W)`` in camera heights from the bounds of its inverse; 0 where they are too far apart."""
-    low, high = least.astype(np.float32), most.astype(np.float32)
-    narrow = (low > 0) & (high < LARGEST_RATIO * low)
-    depth = np.zeros_like(low)
-    depth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
-    return depth
 
 
 EVERY = 5  # frames of a recording or drive, of which one is compared

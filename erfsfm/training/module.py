@@ -14,15 +14,13 @@ from torch import Tensor, nn
 from erfsfm.checkpoint import build_networks
 from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig, NetworkKind, TrainedNetworks
-from erfsfm.data.augmentation import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
 from erfsfm.geometry import pose_vector_to_matrix
-from erfsfm.losses import Bounds
 from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0DepthNet
-from erfsfm.training.objective import Level, ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
+from erfsfm.training.objective import Level, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -63,12 +61,12 @@ class SelfSupervision(lightning.LightningModule):
         return self.depth_net if kind == "depth" else self.pose_net
 
     def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
-        """Colour to [0, 1] where the networks are."""
-        return in_unit_range(batch)
+        """Colour to [0, 1] where the networks are; samples hold it as uint8, a quarter of the bytes to hand over."""
+        return {name: each.float() / 255 if each.dtype == torch.uint8 else each for name, each in batch.items()}
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The loss of one batch; `on_after_backward` stops the run where it is not finite or the depth a constant."""
-        bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
+        bounds = (batch["least"], batch["most"]) if "least" in batch else None
         none = batch["target"].new_zeros(0, self.config.network.sources, *batch["target"].shape[1:])
         sources = batch.get("sources", none)
         snippets = SnippetBatch(
@@ -76,7 +74,12 @@ class SelfSupervision(lightning.LightningModule):
         )
         result = evaluate_objective(self.depth_net, self.pose_net, snippets, self.config)
         self._terms = {name: value.detach() for name, value in result.terms.items()}
-        self._watched = torch.stack([result.total.detach(), _spread(result)])
+        # largest spread of the disparity in an image, standard deviation over mean; infinite without depth
+        spread = result.total.new_full((), torch.inf)
+        if result.disparities:
+            finest = result.disparities[0].detach()
+            spread = (finest.std(dim=(1, 2, 3)) / finest.mean(dim=(1, 2, 3))).amax()
+        self._watched = torch.stack([result.total.detach(), spread])
         self.log("loss", self._watched[0])
         self.log_dict({f"loss/{name}": value for name, value in self._terms.items()})
         return result.total
@@ -220,14 +223,6 @@ class SelfSupervision(lightning.LightningModule):
 
     def _note(self, name: str, value: float) -> None:
         self._validation.setdefault(name, []).append(value)
-
-
-def _spread(result: ObjectiveResult) -> Tensor:
-    """Largest spread of the disparity in an image, standard deviation over mean; infinite without depth."""
-    if not result.disparities:
-        return result.total.new_full((), torch.inf)
-    disparity = result.disparities[0].detach()
-    return (disparity.std(dim=(1, 2, 3)) / disparity.mean(dim=(1, 2, 3))).amax()
 
 
 def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> float:

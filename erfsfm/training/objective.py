@@ -139,29 +139,21 @@ def _evaluate(
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if batch.bounds is not None:
-        teacher_terms = _teacher_terms(disparities, T_source_target, batch, batch.bounds, config)
-        terms |= teacher_terms
+        size = (batch.bounds[0].shape[-2], batch.bounds[0].shape[-1])
+        if disparities:
+            levels = [enlarged(disparity, k, size) for k, disparity in enumerate(disparities)]
+            errors = [disagreement(level, batch.bounds, math.log(HEIGHTS)) for level in levels]
+            terms["structure"] = torch.stack(errors).mean()
+            if config.teacher.edge_weight > 0:
+                terms["edge"] = step_disagreement(disparities[0], batch.bounds)
+        T_measured = batch.T_source_target
+        if needs_poses(config) and T_measured is not None:
+            R_wanted, t_wanted = T_measured[..., :3, :3], T_measured[..., :3, 3] / HEIGHTS
+            terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], R_wanted)
+            terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], t_wanted)
         for name, weight in config.teacher.weights.items():
-            total = total + weight * teacher_terms.get(name, total.new_zeros(()))
+            total = total + weight * terms.get(name, total.new_zeros(()))
     return ObjectiveResult(total, terms, disparities)
-
-
-def _teacher_terms(
-    disparities: list[Tensor], T_source_target: Tensor, batch: SnippetBatch, bounds: Bounds, config: ExperimentConfig
-) -> dict[str, Tensor]:
-    """Loss terms of the teacher's labels."""
-    terms: dict[str, Tensor] = {}
-    if disparities:
-        height, width = bounds.least.shape[-2:]
-        levels = [enlarged(disparity, k, (height, width)) for k, disparity in enumerate(disparities)]
-        terms["structure"] = torch.stack([disagreement(level, bounds, math.log(HEIGHTS)) for level in levels]).mean()
-        if config.teacher.edge_weight > 0:
-            terms["edge"] = step_disagreement(disparities[0], bounds)
-    T_measured = batch.T_source_target
-    if needs_poses(config) and T_measured is not None:
-        terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
-        terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], T_measured[..., :3, 3] / HEIGHTS)
-    return terms
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, by_label, labels_mb, stacked
 from erfsfm.data.split import split_recordings, usable
-from erfsfm.evaluation.protocols import many_view_errors
+from erfsfm.evaluation.protocols import many_view_protocol
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16, learned_inverse_depth
 from erfsfm.model_record import find_weights, read_record
 from erfsfm.networks.lite0 import Lite0DepthNet
@@ -152,7 +152,7 @@ def depth_before_and_after(
     cache, rows = config.teacher.cache or output / MEASUREMENTS, []
     for when, weights in (("before", config.initial_weights), ("after", str(output))):
         networks = DepthPosePredictor.from_weights(weights, device)
-        errors = many_view_errors(networks, validation, cache, True, progress)
+        errors = many_view_protocol(networks, validation, cache, True, progress)
         rows += [{"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT} for row in errors]
     return rows
 

@@ -133,7 +133,7 @@ def test_edge_aware_by_hand() -> None:
 
 
 def bounds(least: float, most: float) -> Bounds:
-    return Bounds(torch.full((1, 1, 4, 4), least), torch.full((1, 1, 4, 4), most))
+    return (torch.full((1, 1, 4, 4), least), torch.full((1, 1, 4, 4), most))
 
 
 ZERO = torch.zeros(1, 1, 1, 1)
@@ -177,7 +177,7 @@ def test_unbounded_pixels_affect_neither_loss_nor_gradients():
     disparity = torch.full((1, 1, 4, 4), 0.5, requires_grad=True)
     least, most = torch.zeros(1, 1, 4, 4), torch.full((1, 1, 4, 4), torch.inf)
     most[..., 0, 0] = 0.25  # something far: only bounded from above
-    interval = Bounds(least, most)
+    interval = (least, most)
     distance = disagreement(disparity, interval, ZERO)
     assert distance.item() == pytest.approx(0.6931, abs=1e-4)
     distance.backward()
@@ -187,7 +187,7 @@ def test_unbounded_pixels_affect_neither_loss_nor_gradients():
 
 def test_a_lower_bound_alone_penalises_farther_depth():
     disparity = torch.tensor([[[[0.05, 0.2]]]], requires_grad=True)
-    interval = Bounds(torch.full((1, 1, 1, 2), 0.1), torch.full((1, 1, 1, 2), torch.inf))
+    interval = (torch.full((1, 1, 1, 2), 0.1), torch.full((1, 1, 1, 2), torch.inf))
     distance = disagreement(disparity, interval, ZERO)
     assert distance.item() == pytest.approx(0.6931, abs=1e-4), "the satisfied pixel does not count"
     distance.backward()
@@ -203,8 +203,8 @@ def test_translation_by_hand_with_one_unmeasured():
 def test_steps_between_pixels_by_hand():
     least = torch.full((1, 1, 1, 16), 0.099)
     least[..., 8:] = 0.198
-    labels = Bounds(least, least * 0.101 / 0.099)
-    edge = (least * labels.most).sqrt()
+    labels = (least, least * 0.101 / 0.099)
+    edge = (least * labels[1]).sqrt()
     assert step_disagreement(edge, labels).item() == pytest.approx(0, abs=1e-6)
     assert step_disagreement(5 * edge, labels).item() == pytest.approx(0, abs=1e-6)  # at any scale
     flat = step_disagreement(torch.full_like(edge, 0.14), labels).item()
@@ -229,6 +229,6 @@ def test_rotation_disagreement_is_the_chordal_distance_to_measured_rotations():
 def test_sky_that_is_far_enough_does_not_dilute_what_is_measured():
     disparity = torch.full((1, 1, 4, 4), 0.1)
     least, most = torch.full((1, 1, 4, 4), 0.2), torch.full((1, 1, 4, 4), 0.2)
-    all_measured = disagreement(disparity, Bounds(least, most), ZERO)
+    all_measured = disagreement(disparity, (least, most), ZERO)
     least[..., :2, :], most[..., :2, :] = 0, 0.5
-    torch.testing.assert_close(disagreement(disparity, Bounds(least, most), ZERO), all_measured)
+    torch.testing.assert_close(disagreement(disparity, (least, most), ZERO), all_measured)

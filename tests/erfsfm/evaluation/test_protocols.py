@@ -16,7 +16,14 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.evaluation.depth_metrics import mean_ratio, standard_error
-from erfsfm.evaluation.protocols import EVERY, TRUTH_FOLDER, depth_protocol, many_view_protocol, pose_protocol
+from erfsfm.evaluation.protocols import (
+    EVERY,
+    TRUTH_FOLDER,
+    depth_protocol,
+    many_view_protocol,
+    named_recordings,
+    pose_protocol,
+)
 from erfsfm.training.run import prepare
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
@@ -244,7 +251,8 @@ def cache(world, tmp_path_factory):
 
 
 def rows_of(networks, world, cache, sequences=(), allow_leak=False):
-    return many_view_protocol(networks, world, sequences, cache, allow_leak, lambda *_: None)
+    recordings = [part for name in sequences for part in named_recordings(world, name)] or discover(world)
+    return many_view_protocol(networks, recordings, cache, allow_leak, lambda *_: None)
 
 
 def test_true_depth_is_right_and_constant_depth_is_wrong(world, cache):

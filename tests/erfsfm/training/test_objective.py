@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.geometry import pose_vector_to_matrix
-from erfsfm.losses import Bounds
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective
 
 PLACES = [(-0.3, 0.05, -0.4), (0.2, -0.1, 0.35)]  # of the two sources; the target is at the origin
@@ -290,7 +289,7 @@ def test_labels_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatc
     height, width = batch.target.shape[-2:]
     half = torch.full((2, 1, height, width), 0.5).double()
     T_source_target = pose_vector_to_matrix(vectors * torch.tensor([10.0] * 3 + [1] * 3))[None].expand(2, 2, 4, 4)
-    right = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
+    right = replace(batch, T_source_target=T_source_target, bounds=(0.098 * half, 0.102 * half))
     assert evaluate(right, _taught(views), 0.5, vectors).total.item() == pytest.approx(0, abs=1e-3)
     for term, vector in {"translation": vectors * 2, "rotation": -vectors}.items():
         assert evaluate(right, _taught(views), 0.5, vector).terms[term].item() > 0.1
@@ -304,7 +303,7 @@ def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, 
     in_heights = true_poses() * torch.tensor([10.0] * 3 + [1] * 3)
     T_source_target = pose_vector_to_matrix(in_heights)[None].expand(2, 2, 4, 4)
     shape = (2, 1, *batch.target.shape[-2:])
-    unbounded = Bounds(torch.zeros(shape).double(), torch.full(shape, torch.inf).double())
+    unbounded = (torch.zeros(shape).double(), torch.full(shape, torch.inf).double())
     labelled = replace(batch, T_source_target=T_source_target, bounds=unbounded)
     config = _taught("many", "depth", photometric_weight=1)
     right = evaluate(labelled, config, 1 / plane.distance, torch.zeros(2, 6).double()).terms["photometric"].item()

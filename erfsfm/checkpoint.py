@@ -138,7 +138,10 @@ def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:
     filled = dict(network.state_dict())
     known = set(trained)
     for key, fresh in filled.items():
-        source = key if key in trained else _elsewhere(key)
+        source = key
+        if key not in trained and key.endswith(".weight"):  # the other network has it deformable, or plain
+            stem = key.removesuffix("weight").removesuffix("kernel.")
+            source = f"{stem}weight" if key.endswith(".kernel.weight") else f"{stem}kernel.weight"
         if source in trained:
             if trained[source].shape != fresh.shape:
                 raise ConfigError(f"'{source}' has another shape than {tuple(fresh.shape)}")
@@ -152,13 +155,6 @@ def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:
     if strange:
         raise ConfigError(f"'{strange[0]}' has no place in this network")
     network.load_state_dict(filled)
-
-
-def _elsewhere(key: str) -> str:
-    """Name of a convolution's kernel where the other network has it deformable, or plain."""
-    if key.endswith(".kernel.weight"):
-        return key.removesuffix("kernel.weight") + "weight"
-    return key.removesuffix("weight") + "kernel.weight" if key.endswith(".weight") else key
 
 
 def _moves_taps(key: str) -> bool:

@@ -161,7 +161,10 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
         elif decoder and kind == "pose":
             continue  # explainability masks: only training would need them
         elif decoder:
-            renamed[_decoder_name(decoder["block"], int(decoder["level"]), decoder["rest"])] = value
+            # our lists run from the coarsest level to the finest; the old names count from the finest
+            block, level, rest = decoder["block"], int(decoder["level"]), decoder["rest"]
+            head = f"heads.{4 - level}.{rest.removeprefix('0.')}"
+            renamed[head if block == "predict_disp" else f"{block}s.{7 - level}.{rest}"] = value
         elif name.startswith("pose_pred."):
             renamed[name.replace("pose_pred.", "pose_head.", 1)] = value
         else:
@@ -176,13 +179,6 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
             ours = _deformable(f"{path}: conv{stage}.{place}", parts)
         renamed |= {f"{prefix}.{rest}": value for rest, value in ours.items()}
     return renamed, tuple(sorted(stages))
-
-
-def _decoder_name(block: str, level: int, rest: str) -> str:
-    """Our lists run from the coarsest level to the finest; the old names count from the finest."""
-    if block == "predict_disp":
-        return f"heads.{4 - level}.{rest.removeprefix('0.')}"
-    return f"{block}s.{7 - level}.{rest}"
 
 
 def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -83,17 +83,6 @@ def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:
     return torch.stack([u.flatten(), v.flatten(), torch.ones_like(u).flatten()])
 
 
-def inverse_intrinsics(K: Tensor) -> Tensor:
-    """``K^-1`` ``(B, 3, 3)`` of camera matrices without skew, in closed form."""
-    inverse = torch.zeros_like(K)
-    inverse[:, 0, 0] = 1 / K[:, 0, 0]
-    inverse[:, 1, 1] = 1 / K[:, 1, 1]
-    inverse[:, 0, 2] = -K[:, 0, 2] / K[:, 0, 0]
-    inverse[:, 1, 2] = -K[:, 1, 2] / K[:, 1, 1]
-    inverse[:, 2, 2] = 1
-    return inverse
-
-
 def backproject(depth: Tensor, K: Tensor) -> Tensor:
     """Lift each pixel to its 3-D point in the camera frame.
 
@@ -107,7 +96,13 @@ def backproject(depth: Tensor, K: Tensor) -> Tensor:
         Points in the camera frame, in the depth's unit, ``(B, 3, H * W)``.
     """
     batch, _, height, width = depth.shape
-    rays = inverse_intrinsics(K) @ pixel_grid(height, width, depth)  # (B, 3, H*W)
+    K_inverse = torch.zeros_like(K)  # in closed form: there is no skew
+    K_inverse[:, 0, 0] = 1 / K[:, 0, 0]
+    K_inverse[:, 1, 1] = 1 / K[:, 1, 1]
+    K_inverse[:, 0, 2] = -K[:, 0, 2] / K[:, 0, 0]
+    K_inverse[:, 1, 2] = -K[:, 1, 2] / K[:, 1, 1]
+    K_inverse[:, 2, 2] = 1
+    rays = K_inverse @ pixel_grid(height, width, depth)  # (B, 3, H*W)
     return rays * depth.reshape(batch, 1, height * width)
 
 
@@ -151,11 +146,6 @@ def pose_vector_to_matrix(pose_vec_trans_euler: Tensor) -> Tensor:
     return torch.cat([top, torch.cat([none[..., :3], none[..., 3:] + 1], dim=-1)], dim=-2)
 
 
-def transform_points(T_a_b: Tensor, points_b: Tensor) -> Tensor:
-    """Points ``(B, 3, P)`` in b moved to a by ``T_a_b`` ``(B, 4, 4)``."""
-    return T_a_b[:, :3, :3] @ points_b + T_a_b[:, :3, 3:]
-
-
 MINIMUM_Z = 1e-3
 
 
@@ -174,7 +164,7 @@ def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> tu
         is in front of the source camera and inside its image, ``(B, 1, H, W)``.
     """
     batch, _, height, width = depth.shape
-    points_source = transform_points(T_source_target, backproject(depth, K))  # (B, 3, H*W)
+    points_source = T_source_target[:, :3, :3] @ backproject(depth, K) + T_source_target[:, :3, 3:]  # (B, 3, H*W)
     z = points_source[:, 2:]
     pixels = (K @ points_source)[:, :2] / z.clamp(min=MINIMUM_Z)  # (B, 2, H*W)
     extents = max(width - 1, 1), max(height - 1, 1)

@@ -252,9 +252,7 @@ def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.
     return np.reciprocal(_predictor(weights).depth(image))
 
 
-@lru_cache(maxsize=1)
-def _predictor(weights: str) -> DepthPosePredictor:
-    return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
+_predictor = lru_cache(maxsize=1)(partial(DepthPosePredictor.from_weights, device="cpu", runtime="onnx"))
 
 
 def _input(image: NDArray[np.uint8] | Array, height: int, width: int) -> Array:

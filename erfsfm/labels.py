@@ -8,7 +8,7 @@ nearest to the flow's end point; the neighbours' answers are averaged where they
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -153,10 +153,7 @@ def in_camera_heights(learned: Array, measured: Array, sigma: Array) -> Array | 
     return learned * np.float32(np.median(measured[known] / learned[known]))
 
 
-@lru_cache(maxsize=1)
-def _fusion() -> DepthFusion:
-    """In this process."""
-    return DepthFusion("default")
+_fusion = lru_cache(maxsize=1)(partial(DepthFusion, "default"))  # of this process
 
 
 TOLERANCE = 0.05  # of the distance

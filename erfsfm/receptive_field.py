@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
-from torch import Tensor
 
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ConfigError
@@ -175,7 +174,12 @@ def _row(
         trained = model.networks.get(kind)
         if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
             network, weights = trained, title
-    weighed = field_of(network.encoder.eval().to(device), _encoder_input(snippet, network).to(device))
+    # the middle image ``(1, C, H, W)`` in [-1, 1], for a pose network with its sources behind it
+    sources, middle = network.input_channels // 3 - 1, len(snippet) // 2
+    around = [i for i in range(middle - sources // 2, middle + (sources + 1) // 2 + 1) if i != middle]
+    images = np.stack([snippet[i] for i in (middle, *around)]).transpose(0, 3, 1, 2).reshape(1, -1, *size)
+    shown = torch.from_numpy(images).float() / 127.5 - 1
+    weighed = field_of(network.encoder.eval().to(device), shown.to(device))
     summary = {
         "name": name,
         "fidelity": fidelity,
@@ -191,16 +195,6 @@ def _row(
     }
     title = f"{name} (paper)" if fidelity == "paper" else name
     return FieldRow(title, summary, theoretical_corner(probe, seen.pixel, pushed), seen, weighed)
-
-
-def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Tensor:
-    """``(1, C, H, W)`` in [-1, 1]: the middle image, for a pose network with its sources behind it."""
-    sources = network.input_channels // 3 - 1
-    middle = len(snippet) // 2
-    around = [i for i in range(middle - sources // 2, middle + (sources + 1) // 2 + 1) if i != middle]
-    images = np.stack([snippet[middle], *(snippet[i] for i in around)])
-    stacked = torch.from_numpy(images).permute(0, 3, 1, 2)  # (1 + N, 3, H, W)
-    return stacked.reshape(1, -1, *images.shape[1:3]).float() / 127.5 - 1
 
 
 def street_snippet(frames: int, height: int, width: int) -> list[NDArray[np.uint8]]:

@@ -242,7 +242,12 @@ class ManyViewTeacher:
             if recording.labels is not None:
                 drive = DriveLabels(recording, recording.labels, self._size, self._stride, True, recording.skipped)
             else:
-                drive = DriveLabels(recording, self._folder / _digest(recording), self._size, self._stride)
+                # of the camera, the names, sizes and times of the images, and the version of this file
+                stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
+                seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
+                seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
+                digest = hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
+                drive = DriveLabels(recording, self._folder / digest, self._size, self._stride)
             self._drives[recording.key] = drive
         return self._drives[recording.key]
 
@@ -293,14 +298,6 @@ class ManyViewTeacher:
                         progress("teacher: depth", done, total)
 
 
-def _digest(recording: Recording) -> str:
-    """Of the camera, the names, sizes and times of the images, and the version of this file."""
-    stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
-    seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
-    seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
-    return hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
-
-
 def _grey(image: NDArray[np.uint8]) -> Grey:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
@@ -329,8 +326,10 @@ def encode(least: NDArray[np.floating], most: NDArray[np.floating]) -> bytes:
     steps = np.where(measured, np.maximum(np.floor(LEAST_SIGMA * 2**doublings / STEP), 1), 1)
     code = (low + high - 2 * np.log(SMALLEST)) / (2 * STEP)
     code = np.clip(np.rint(code / steps) * steps, 0, 255)
+    # an unknown pixel has the code of the known one left of it: small when compressed
+    known_before = np.maximum.accumulate(np.where(known, np.arange(least.shape[1]), 0), axis=1)
     picture = np.zeros((*least.shape, 3), np.uint8)
-    picture[..., 0], picture[..., 1] = kind, _continued(code.astype(np.uint8), known)
+    picture[..., 0], picture[..., 1] = kind, np.take_along_axis(code.astype(np.uint8), known_before, axis=1)
     return bytes(cv2.imencode(".webp", picture, _LOSSLESS)[1])
 
 
@@ -348,9 +347,3 @@ def decode(data: bytes) -> tuple[Bound, Bound]:
     ratio_most = np.where(bounded_above, np.exp(sigma), np.inf).astype(np.float32)
     kind, middle = picture[..., 0], value.astype(np.float32)[picture[..., 1]]
     return (middle * ratio_least[kind]).astype(np.float16), (middle * ratio_most[kind]).astype(np.float16)
-
-
-def _continued(code: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Unknown pixels with the code of the known pixel left of them: small when compressed."""
-    columns = np.where(known, np.arange(code.shape[1]), 0)
-    return np.asarray(np.take_along_axis(code, np.maximum.accumulate(columns, axis=1), axis=1))

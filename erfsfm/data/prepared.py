@@ -59,7 +59,25 @@ def _file(folder: Path, kind: Literal["images", "depth"], frame: int) -> Path:
 def read_prepared(root: Path) -> list[Recording]:
     """The recordings of a prepared folder; ``DataError`` where its index is damaged."""
     index = read_model(_Index, root / INDEX_FILE, DataError, "is damaged, prepare again")
-    return [_recording(root / f"{number:04d}", entry) for number, entry in enumerate(index.recordings)]
+    recordings = []
+    for place, entry in enumerate(index.recordings):
+        folder = root / f"{place:04d}"
+        numbers, poses = range(entry.start, entry.start + entry.frames), folder / _POSES
+        depth = tuple(path if (path := _file(folder, "depth", n)).is_file() else None for n in numbers)
+        recording = Recording(
+            entry.name,
+            tuple(_file(folder, "images", n) for n in numbers),
+            entry.camera,
+            depth=depth if any(depth) else None,
+            poses_file=poses if poses.is_file() else None,
+            camera_height_m=entry.camera_height_m,
+            start=entry.start,
+            stored=entry.frames,
+            without_stops=True,
+            labels=folder / _LABELS,
+        )
+        recordings.append(recording)
+    return recordings
 
 
 def write_prepared(
@@ -91,7 +109,12 @@ def write_prepared(
             folder = unfinished / f"{number:04d}"
             unreadable += _write_images(folder, recording, network)
             if number >= len(training):
-                _write_truth(folder, recording, middle)
+                depth_file = recording.depth[middle] if recording.depth else None
+                if depth_file is not None:  # of the middle frame, as it is stored
+                    written = _file(folder, "depth", recording.start + middle)
+                    write_atomically(written, depth_file.read_bytes(), sync=False)
+                if (T_world_camera := recording.true_poses()) is not None:
+                    np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
             elif recording.exact:
                 for index in range(len(recording)):
                     depth = np.rint(recording.shrunk_depth(index, network.height, network.width) * 256)
@@ -116,24 +139,6 @@ def write_prepared(
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _recording(folder: Path, entry: _Entry) -> Recording:
-    numbers = range(entry.start, entry.start + entry.frames)
-    depth = tuple(path if (path := _file(folder, "depth", n)).is_file() else None for n in numbers)
-    poses = folder / _POSES
-    return Recording(
-        entry.name,
-        tuple(_file(folder, "images", n) for n in numbers),
-        entry.camera,
-        depth=depth if any(depth) else None,
-        poses_file=poses if poses.is_file() else None,
-        camera_height_m=entry.camera_height_m,
-        start=entry.start,
-        stored=entry.frames,
-        without_stops=True,
-        labels=folder / _LABELS,
-    )
-
-
 def _write_images(folder: Path, recording: Recording, network: NetworkConfig) -> list[str]:
     """Write the frames; returns what is wrong with those that cannot be read."""
 
@@ -149,16 +154,6 @@ def _write_images(folder: Path, recording: Recording, network: NetworkConfig) ->
     one_by_one = recording.video is not None  # a video is decoded in order
     with ThreadPoolExecutor(1 if one_by_one else os.cpu_count()) as pool:
         return [problem for problem in pool.map(shrink, range(len(recording))) if problem]
-
-
-def _write_truth(folder: Path, snippet: Recording, middle: int) -> None:
-    """Write what is known of a snippet to validate on: depth of its middle frame, as it is stored, and poses."""
-    depth = snippet.depth[middle] if snippet.depth else None
-    if depth is not None:
-        write_atomically(_file(folder, "depth", snippet.start + middle), depth.read_bytes(), sync=False)
-    T_world_camera = snippet.true_poses()
-    if T_world_camera is not None:
-        np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
 
 
 def _write_labels(measured: DriveLabels, folder: Path, network: NetworkConfig) -> None:

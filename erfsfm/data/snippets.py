@@ -63,7 +63,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self.recordings = usable(recordings, length)
         self._exact, self._measured = by_label(self.recordings, config)
         weights = config.data.weights
-        _require_known(self.recordings, weights)
+        for prefix in weights:
+            if not any(recording.name.startswith(prefix) for recording in self.recordings):
+                raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
+        for recording in self.recordings:
+            if weights and not recording.name.startswith(tuple(weights)):
+                raise DataError(
+                    f"data.weights gives '{recording.name}' no weight: name it there, or leave its data set out"
+                )
         windows = [len(recording) - length + 1 for recording in self._measured]
         self._probabilities = chances(self._measured, windows, weights)
         # a long world is as good as a short one
@@ -113,18 +120,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
 
     def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
         """Random snippets without end."""
+        sources = self._config.network.sources
         while True:
             recording = self._measured[int(rng.choice(len(self._measured), p=self._probabilities))]
-            starts = self._starts(recording)
+            starts = range(len(recording) - sources)  # first frames of the snippets that may be drawn
+            if self._many_views is not None:
+                targets = self._many_views.drive(recording).targets(sources)
+                starts = range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
             yield Snippet(recording, starts[int(rng.integers(len(starts)))])
-
-    def _starts(self, recording: Recording) -> range:
-        """First frames of the snippets that may be drawn."""
-        sources = self._config.network.sources
-        if self._many_views is None:
-            return range(len(recording) - sources)
-        targets = self._many_views.drive(recording).targets(sources)
-        return range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
 
     def _structure(self, snippet: Snippet, images: list[NDArray[np.uint8]], camera: Camera) -> TeacherStructure | None:
         """The label of a snippet, if there is a teacher."""
@@ -186,18 +189,6 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 def labels_mb(config: DataConfig) -> int:
     """The part of ``data.cache_mb`` for labels of many views: larger than images, but fewer."""
     return config.cache_mb * 2 // 5
-
-
-def _require_known(recordings: Sequence[Recording], weights: Mapping[str, float]) -> None:
-    """Refuse weights of nothing, and recordings without one."""
-    for prefix in weights:
-        if not any(recording.name.startswith(prefix) for recording in recordings):
-            raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
-    for recording in recordings:
-        if weights and not recording.name.startswith(tuple(weights)):
-            raise DataError(
-                f"data.weights gives '{recording.name}' no weight: name it there, or leave its data set out"
-            )
 
 
 def chances(recordings: Sequence[Recording], sizes: Sequence[int], weights: Mapping[str, float]) -> NDArray[np.float64]:

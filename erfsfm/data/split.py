@@ -55,7 +55,17 @@ class Split(Section):
 
     def test_frames(self) -> list[tuple[str, int]]:
         """Every single frame to test on: its recording and number."""
-        return [frame for name in self.test for frame in _frames(name)]
+        frames: list[tuple[str, int]] = []
+        for name in self.test:
+            match = _FRAMES.fullmatch(name.strip())
+            runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
+            if match is None or None in runs:
+                raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
+            for run in filter(None, runs):
+                first = int(run["first"])
+                numbers = range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
+                frames += [(match["recording"], number) for number in numbers]
+        return frames
 
 
 def read_split_file(name_or_path: str) -> Split:
@@ -69,18 +79,6 @@ def read_split_file(name_or_path: str) -> Split:
             raise DataError(f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}")
         path = shipped[name_or_path]
     return read_model(Split, path, DataError, "is no split of train, validation and test")
-
-
-def _frames(name: str) -> list[tuple[str, int]]:
-    match = _FRAMES.fullmatch(name.strip())
-    runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
-    if match is None or None in runs:
-        raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
-    numbers: list[int] = []
-    for run in filter(None, runs):
-        first = int(run["first"])
-        numbers += range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
-    return [(match["recording"], number) for number in numbers]
 
 
 def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
@@ -106,9 +104,10 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if unknown:
         raise DataError(f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}")
     found = [recording for root in config.roots for recording in discover(root)]
+    names = _some([recording.name for recording in found])
     for key, span in zip(config.ranges, ranges):
         if not any(_spans(recording, [span]) for recording in found):
-            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {_names(found)}")
+            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {names}")
     _require_begun(found, [*ranges, *listed, *held_out])
     training: list[Recording] = []
     validation: list[Recording] = []
@@ -122,7 +121,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             training += _rest(part, forbidden)
     if not training:
         raise DataError(
-            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used to validate or "
+            f"nothing left to train on: every recording found ({names}) is excluded or used to validate or "
             "test; see data.exclude, data.validation and data.split"
         )
     if config.validation_share > 0:
@@ -131,7 +130,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
         wanted = _some([*config.validation, *split.validation])
         raise DataError(
-            f"nothing to validate on: data.validation and data.split name {wanted}; found {_names(found)}; name one of "
+            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of "
             "these, or train without validation by data.validation=[]"
         )
     named = config.validation if config.validation != _DEFAULT_VALIDATION else []
@@ -159,10 +158,6 @@ def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Rec
 
 def _lengths(recordings: Sequence[Recording]) -> str:
     return _some([f"{recording.name} ({len(recording)} frames)" for recording in recordings])
-
-
-def _names(recordings: Sequence[Recording]) -> str:
-    return _some([recording.name for recording in recordings])
 
 
 def _some(names: Sequence[str]) -> str:

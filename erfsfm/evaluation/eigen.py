@@ -101,7 +101,13 @@ def eigen_protocol(
     for frame in frames:
         image = read_image(frame.image_path())
         truth = lidar_depth(frame, image.shape[:2], fidelity)
-        guess = _depth(networks, image, fidelity)
+        if fidelity == "default":
+            guess = networks.depth(image)
+        else:
+            size = networks.record.depth_input or networks.record.network
+            small = networks.depth(resize_image(image, size.height, size.width))
+            factors = (image.shape[0] / small.shape[0], image.shape[1] / small.shape[1])
+            guess = np.asarray(zoom(small, factors, order=3), dtype=np.float32)
         found = compare(guess, truth)
         if found is None:
             raise DataError(f"the LiDAR of {frame.name} hits nothing under {CAP_M:g} m in the crop")
@@ -114,16 +120,6 @@ def eigen_protocol(
             errors["pose"].append(by_motion)
     rows = [_row("networks", scaling, found, len(frames), leak) for scaling, found in errors.items()]
     return [*rows, _row("flat road", "gt-median", flat, len(frames), leak=False)]
-
-
-def _depth(networks: DepthPosePredictor, image: NDArray[np.uint8], fidelity: Fidelity) -> NDArray[np.float32]:
-    """Unscaled depth at the image's size."""
-    if fidelity == "default":
-        return networks.depth(image)
-    size = networks.record.depth_input or networks.record.network
-    depth = networks.depth(resize_image(image, size.height, size.width))
-    height, width = image.shape[:2]
-    return np.asarray(zoom(depth, (height / depth.shape[0], width / depth.shape[1]), order=3), dtype=np.float32)
 
 
 def _scale_of_motion(networks: DepthPosePredictor, frame: RawFrame, fidelity: Fidelity) -> float | None:

@@ -153,7 +153,9 @@ def _improved(first: Tensor, second: Tensor, flow: Tensor, level: _Level) -> tup
         margin = (level.cell - level.stride) // 2
         return list(F.avg_pool2d(torch.cat(values, dim=1), level.cell, level.stride, margin).split(1, dim=1))
 
-    g_x, g_y = _gradient(first)
+    wide = F.pad(first, (1, 1, 1, 1), mode="replicate")  # for central differences ``(B, 1, h, w)``
+    g_x = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) / 2
+    g_y = (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) / 2
     xx, xy, yy = mean(g_x * g_x, g_x * g_y, g_y * g_y)
     m_xx, m_yy = xx + _LEAST_TEXTURE, yy + _LEAST_TEXTURE
     determinant = m_xx * m_yy - xy * xy
@@ -168,12 +170,6 @@ def _improved(first: Tensor, second: Tensor, flow: Tensor, level: _Level) -> tup
     counted = (from_middle < edges / 2 - level.cell * (_SHOWN - 0.5)).all(dim=1, keepdim=True).to(first.dtype)
     variance = (square + _GREY_NOISE**2) / _INDEPENDENT
     return flow, torch.cat([xx, yy], dim=1) * counted / variance
-
-
-def _gradient(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Central differences ``(B, 1, h, w)`` along x and along y."""
-    wide = F.pad(image, (1, 1, 1, 1), mode="replicate")
-    return (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) / 2, (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) / 2
 
 
 def _inserted(values: Tensor, between: Tensor, middle: int) -> Tensor:

@@ -56,7 +56,18 @@ class OnnxGraph:
         """The network's output."""
         key = self._key([array.shape for array in _flat(inputs)])
         if key not in self._infer:
-            self._infer[key] = self._chosen(key, *inputs)
+            graph = kept(key)
+            if graph is None:
+                from erfsfm.networks.deformable import has_large_sampling
+                from erfsfm.networks.torch_network import TorchNetwork, exported, tensors
+
+                network, example = self._network(), tensors(inputs)
+                if has_large_sampling(network, *example):
+                    self._infer[key] = TorchNetwork(network, "cpu")
+                    return self._infer[key](*inputs)
+                graph = exported(network, example)
+                keep(key, graph)
+            self._infer[key] = partial(_run, open_session(graph, self._threads))
         return self._infer[key](*inputs)
 
     def is_kept(self, *shapes: tuple[int, ...]) -> bool:
@@ -65,19 +76,6 @@ class OnnxGraph:
 
     def _key(self, shapes: Sequence[tuple[int, ...]]) -> str:
         return f"{self._identity} {list(shapes)}"
-
-    def _chosen(self, key: str, *inputs: Array | list[Array]) -> Callable[..., Array]:
-        graph = kept(key)
-        if graph is None:
-            from erfsfm.networks.deformable import has_large_sampling
-            from erfsfm.networks.torch_network import TorchNetwork, exported, tensors
-
-            network, example = self._network(), tensors(inputs)
-            if has_large_sampling(network, *example):
-                return TorchNetwork(network, "cpu")
-            graph = exported(network, example)
-            keep(key, graph)
-        return partial(_run, open_session(graph, self._threads))
 
 
 def _flat(inputs: Sequence[Array | list[Array]]) -> list[Array]:

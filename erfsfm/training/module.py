@@ -214,12 +214,16 @@ class SelfSupervision(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Note and log what the first process measured, by which all of them decide what to keep."""
+        self.validation_metrics = self.trainer.strategy.broadcast(self.measured())
+        self.log_dict({f"validation/{name}": value for name, value in self.validation_metrics.items()})
+
+    def measured(self) -> dict[str, float]:
+        """Mean of every metric, and the spread of the depth scale, which limits a SLAM system's scale drift."""
         means = {name: float(np.mean(values)) for name, values in self._validation.items()}
         scales = np.array(self._validation.get("depth_scale", []))
-        if len(scales) > 1:  # their spread limits a SLAM system's scale drift
+        if len(scales) > 1:
             means["depth_scale_spread"] = float(scales.std() / scales.mean())
-        self.validation_metrics = self.trainer.strategy.broadcast(means)
-        self.log_dict({f"validation/{name}": value for name, value in self.validation_metrics.items()})
+        return means
 
     def _note(self, name: str, value: float) -> None:
         self._validation.setdefault(name, []).append(value)

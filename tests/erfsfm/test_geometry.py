@@ -19,7 +19,6 @@ from erfsfm.geometry import (
     project_into_source,
     sample,
     scale_intrinsics,
-    transform_points,
 )
 
 CAMERA = Camera(width=400, height=120, fx=300.0, fy=280.0, cx=190.0, cy=61.5)
@@ -117,10 +116,10 @@ def test_translation_comes_first() -> None:
     assert T[3].tolist() == [0, 0, 0, 1]
 
 
-def test_transform_points_rotates_then_translates() -> None:
+def test_a_pose_rotates_then_translates() -> None:
     T_a_b = pose_vector_to_matrix(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2]]).double())
-    points_b = torch.tensor([[[1.0], [0.0], [5.0]]]).double()
-    torch.testing.assert_close(transform_points(T_a_b, points_b), torch.tensor([[[1.0], [1.0], [5.0]]]).double())
+    point_b = torch.tensor([1.0, 0.0, 5.0, 1.0]).double()
+    torch.testing.assert_close(T_a_b[0] @ point_b, torch.tensor([1.0, 1.0, 5.0, 1.0]).double())
 
 
 def camera(width: int, height: int, focal: float = 50.0) -> Tensor:

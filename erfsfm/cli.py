@@ -7,7 +7,6 @@ import logging
 import math
 import shlex
 import sys
-import tempfile
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -172,7 +171,6 @@ def evaluate_depth(
 
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
-    from erfsfm.data.discovery import discover
     from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.evaluation.protocols import depth_protocol, many_view_protocol, named_recordings
     from erfsfm.inference import DepthPosePredictor
@@ -189,11 +187,8 @@ def evaluate_depth(
     networks = {name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)}
     with progress_bar() as show:
         if truth == "many-views":
-            recordings = [part for name in sequence or () for part in named_recordings(dataset[0], name)]
-            recordings = recordings or discover(dataset[0])
-            with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:
-                kept = cache or Path(folder)
-                rows = many_view_protocol(networks["networks"], recordings, kept, allow_leak, show)
+            parts = [part for name in sequence or [""] for part in named_recordings(dataset[0], name)]
+            rows = many_view_protocol(networks["networks"], parts, cache, allow_leak, show)
         elif split is None:
             rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
         else:

@@ -6,6 +6,7 @@ On other drives static surfaces are measured from neighbouring frames at a run's
 
 from __future__ import annotations
 
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -175,7 +176,12 @@ def pose_protocol(
 
 
 def named_recordings(root: Path, name: str) -> list[Recording]:
-    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera."""
+    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera.
+
+    Without a name they are all recordings of the root.
+    """
+    if not name:
+        return discover(root)
     found: dict[str, list[Recording]] = {}
     for each in discover(root):
         for known in {each.name, each.sequence or each.name}:
@@ -222,7 +228,11 @@ _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: th
 
 
 def many_view_protocol(
-    networks: DepthPosePredictor, recordings: Sequence[Recording], cache: Path, allow_leak: bool, progress: Progress
+    networks: DepthPosePredictor,
+    recordings: Sequence[Recording],
+    cache: Path | None,
+    allow_leak: bool,
+    progress: Progress,
 ) -> list[dict[str, Any]]:
     """Median-scaled depth errors where the many-view teacher knows the depth within ``LARGEST_RATIO``.
 
@@ -232,7 +242,7 @@ def many_view_protocol(
     Args:
         networks: to evaluate.
         recordings: whole drives, or parts of them.
-        cache: receives poses and depth, for the next call.
+        cache: receives poses and depth, for the next call; forgotten where None.
         allow_leak: evaluate also frames that the networks were trained on.
         progress: told of the stage, what is done, and of how many.
 
@@ -245,28 +255,32 @@ def many_view_protocol(
     """
     leaks = [refuse_leak(networks, [each.frames_name], allow_leak) for each in recordings]
     rows = []
-    for recording, leak in zip(recordings, leaks):
-        width, height = recording.camera.width, recording.camera.height
-        ratio = min(1.0, LARGEST_WIDTH / width)
-        # the teacher's labels are measured around a network's depth, and truth without any
-        teacher = ManyViewTeacher(cache / TRUTH_FOLDER, (round(height * ratio), round(width * ratio)), EVERY)
-        teacher.prepare([recording], networks.sources, SLAM_WEIGHTS, progress)
-        drive, errors, known = teacher.drive(recording), [], []
-        for target in drive.targets(networks.sources):
-            low, high = (bound.astype(np.float32) for bound in drive.label(target))
-            narrow = (low > 0) & (high < LARGEST_RATIO * low)
-            truth = np.zeros_like(low)  # where the bounds are too far apart
-            truth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
-            error = depth_errors(networks.depth(recording.image(target, *truth.shape)), truth, CAP_HEIGHTS)
-            if error is not None:
-                errors.append(error)
-                known.append(float(np.mean((truth > 0) & (truth < CAP_HEIGHTS))))
-        if not errors:
-            raise DataError(f"no depth could be measured in {recording.frames_name}: the camera has to travel")
-        mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
-        row = {"method": "networks", "recording": recording.frames_name} | {key: getattr(mean, key) for key in _RATIOS}
-        row |= {"scale_spread": float(scales.std() / scales.mean()), "known": float(np.mean(known))}
-        rows.append(row | {"images": len(errors), "leak": leak})
+    with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as temporary:
+        for recording, leak in zip(recordings, leaks):
+            ratio = min(1.0, LARGEST_WIDTH / recording.camera.width)
+            size = (round(recording.camera.height * ratio), round(recording.camera.width * ratio))
+            # the teacher's labels are measured around a network's depth, and truth without any
+            teacher = ManyViewTeacher((cache or Path(temporary)) / TRUTH_FOLDER, size, EVERY)
+            teacher.prepare([recording], networks.sources, SLAM_WEIGHTS, progress)
+            drive, errors, known = teacher.drive(recording), [], []
+            for target in drive.targets(networks.sources):
+                low, high = (bound.astype(np.float32) for bound in drive.label(target))
+                narrow = (low > 0) & (high < LARGEST_RATIO * low)
+                truth = np.zeros_like(low)  # where the bounds are too far apart
+                truth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
+                error = depth_errors(networks.depth(recording.image(target, *truth.shape)), truth, CAP_HEIGHTS)
+                if error is not None:
+                    errors.append(error)
+                    known.append(float(np.mean((truth > 0) & (truth < CAP_HEIGHTS))))
+            if not errors:
+                raise DataError(f"no depth could be measured in {recording.frames_name}: the camera has to travel")
+            mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
+            row: dict[str, Any] = {"method": "networks", "recording": recording.frames_name}
+            row |= {key: getattr(mean, key) for key in _RATIOS} | {
+                "scale_spread": float(scales.std() / scales.mean()),
+                "known": float(np.mean(known)),
+            }
+            rows.append(row | {"images": len(errors), "leak": leak})
     return rows
 
 

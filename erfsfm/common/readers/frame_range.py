@@ -71,12 +71,8 @@ class FrameRange:
 def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
     """Those of ``names`` that share frames with what was ``seen`` in training; empty where nothing leaks."""
     ranges = [FrameRange.parse(name) for name in seen]
-
-    def leaks(name: str) -> bool:
-        wanted = FrameRange.parse(name)
-        return any(wanted.covers(each) for each in ranges)
-
-    return [name for name in names if leaks(name)]
+    wanted = [(name, FrameRange.parse(name)) for name in names]
+    return [name for name, frames in wanted if any(frames.covers(each) for each in ranges)]
 
 
 def merge(names: Iterable[str]) -> list[str]:

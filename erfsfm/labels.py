@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from erfsfm.mvs import refine
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.views import Appearance
+from erfsfm.mvs.views import Appearance, Array, Grey
 
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)  # frames
 MIN_SNR = 5.0  # inverse depth over its sigma
@@ -265,9 +265,6 @@ def impose_road(
     inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
     return at_least
 
-
-Grey = NDArray[np.uint8]
-Array = NDArray[np.float32]
 
 FLOW_NOISE_PX = 0.3
 ROUND_TRIP_PX = 0.5

@@ -276,10 +276,8 @@ def many_view_protocol(
                 raise DataError(f"no depth could be measured in {recording.frames_name}: the camera has to travel")
             mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
             row: dict[str, Any] = {"method": "networks", "recording": recording.frames_name}
-            row |= {key: getattr(mean, key) for key in _RATIOS} | {
-                "scale_spread": float(scales.std() / scales.mean()),
-                "known": float(np.mean(known)),
-            }
+            row |= {key: getattr(mean, key) for key in _RATIOS}
+            row |= {"scale_spread": float(scales.std() / scales.mean()), "known": float(np.mean(known))}
             rows.append(row | {"images": len(errors), "leak": leak})
     return rows
 

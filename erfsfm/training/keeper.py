@@ -250,8 +250,7 @@ class OutputFolder:
             TrainingError: nothing to resume, or a damaged checkpoint; one line.
             ConfigError: the run began with another network, or with what the optimiser's state does not fit; one line.
         """
-        written = self.config
-        for needed in (self.checkpoint, written):
+        for needed in (self.checkpoint, self.config):
             if not needed.is_file():
                 raise TrainingError(f"nothing to resume in {self.path}: no {needed.name}; start without --resume")
         wrong = "is damaged or no checkpoint: start again in another --output"
@@ -260,11 +259,11 @@ class OutputFolder:
         is_whole = isinstance(state, dict) and known <= state.keys()
         if not is_whole or {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
             raise TrainingError(f"{self.checkpoint} {wrong}")
-        begun, wanted = read_yaml(written), config.model_dump(mode="json")  # begun with settings of another version
+        begun, wanted = read_yaml(self.config), config.model_dump(mode="json")  # begun with settings of another version
         if begun["network"] != wanted["network"]:
-            raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
+            raise ConfigError(f"the networks of {self.config} differ from this configuration: resume with the same one")
         for key in ("networks", "frozen_stages"):
             before, now = begun["training"][key], wanted["training"][key]
             if before != now:
-                raise ConfigError(f"{written} began with training.{key} {before}; got {now}: resume with the same")
+                raise ConfigError(f"{self.config} began with training.{key} {before}; got {now}: resume with the same")
         return int(state["global_step"])

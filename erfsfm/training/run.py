@@ -94,7 +94,7 @@ def train(
     minutes = config.training.minutes
     timer = Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)  # keeps its time in checkpoints
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(config, training, (done_steps, rank), output, progress)
+    draws = _draws(config, training, done_steps, output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
@@ -158,16 +158,15 @@ def depth_before_and_after(
 
 
 def _draws(
-    config: ExperimentConfig, training: list[Recording], position: tuple[int, int], output: Path, progress: Progress
+    config: ExperimentConfig, training: list[Recording], done_steps: int, output: Path, progress: Progress
 ) -> SnippetDraws:
-    """What this process trains on; ``position``: steps done and rank."""
-    done_steps, rank = position
+    """What this process trains on after some steps."""
     together = config.training.batch * config.training.devices
     views = measured_views(training, config, config.teacher.cache or output / MEASUREMENTS, progress)
     last, done = config.training.steps * together, done_steps * together
     imitates = config.teacher.views == "network"
     imitated = partial(learned_inverse_depth, config.teacher.slam_weights) if imitates else None
-    return SnippetDraws(training, config, last, done, rank, views, imitated)
+    return SnippetDraws(training, config, last, done, LightningEnvironment().local_rank(), views, imitated)
 
 
 def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> DataLoader[dict[str, Tensor]]:

@@ -30,8 +30,8 @@ from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import ArrayCache, TeacherStructure, snippet_motion
 from erfsfm.geometry import Camera
-from erfsfm.labels import NEIGHBOURS, Grey, in_camera_heights, label, measure, refined_label, shrunk
-from erfsfm.mvs.views import neighbours_around
+from erfsfm.labels import NEIGHBOURS, in_camera_heights, label, measure, refined_label, shrunk
+from erfsfm.mvs.views import Grey, neighbours_around
 
 VERSION = 4
 # pixels of the images that flow alone measures: finer flow is slower and no surer; twice the networks' width would

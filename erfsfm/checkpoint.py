@@ -58,8 +58,11 @@ def save_model(folder: Path, model: Model, half: bool = False) -> None:
     """
     for kind, net in model.networks.items():
         # through memory: errors of a full disk come from the library as an exception of its own
-        content = save({key: _stored(key, value, half) for key, value in net.state_dict().items()})
-        write_atomically(tensors_file(folder, kind), content)
+        tensors = {key: value.detach().cpu().contiguous() for key, value in net.state_dict().items()}
+        for key, value in tensors.items() if half else ():
+            if value.is_floating_point() and "running_" not in key:
+                tensors[key] = value.half()
+        write_atomically(tensors_file(folder, kind), save(tensors))
     write_atomically(folder / "model.yaml", dump_yaml(model.record))
 
 
@@ -79,11 +82,6 @@ def load_model(name_or_folder: str | Path) -> Model:
         tensors = {key: torch.tensor(value) for key, value in read_tensors(folder, kind).items()}
         fill_network(networks[kind].eval(), tensors, tensors_file(folder, kind), "model.yaml says")
     return Model(record, {kind: networks[kind] for kind in record.kinds})
-
-
-def _stored(key: str, value: torch.Tensor, half: bool) -> torch.Tensor:
-    statistics = "running_" in key or not value.is_floating_point()
-    return value.detach().cpu().contiguous() if statistics or not half else value.detach().cpu().half().contiguous()
 
 
 def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path, wanted_by: str) -> None:
@@ -140,7 +138,10 @@ def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:
     filled = dict(network.state_dict())
     known = set(trained)
     for key, fresh in filled.items():
-        source = key if key in trained else _elsewhere(key)
+        source = key
+        if key not in trained and key.endswith(".weight"):  # the other network has it deformable, or plain
+            stem = key.removesuffix("weight").removesuffix("kernel.")
+            source = f"{stem}weight" if key.endswith(".kernel.weight") else f"{stem}kernel.weight"
         if source in trained:
             if trained[source].shape != fresh.shape:
                 raise ConfigError(f"'{source}' has another shape than {tuple(fresh.shape)}")
@@ -154,13 +155,6 @@ def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:
     if strange:
         raise ConfigError(f"'{strange[0]}' has no place in this network")
     network.load_state_dict(filled)
-
-
-def _elsewhere(key: str) -> str:
-    """Name of a convolution's kernel where the other network has it deformable, or plain."""
-    if key.endswith(".kernel.weight"):
-        return key.removesuffix("kernel.weight") + "weight"
-    return key.removesuffix("weight") + "kernel.weight" if key.endswith(".weight") else key
 
 
 def _moves_taps(key: str) -> bool:

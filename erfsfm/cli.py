@@ -62,7 +62,7 @@ def train(
 
     Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
     """
-    from erfsfm.config import load_experiment
+    from erfsfm.config import UNTRAINED, load_experiment
     from erfsfm.training.run import depth_before_and_after
     from erfsfm.training.run import prepare as prepare_training
     from erfsfm.training.run import train as run_training
@@ -79,7 +79,7 @@ def train(
         folder = run_training(experiment, output, resume, device, _command(), progress)
         typer.echo(f"weights in {folder}: use them with --weights {folder}")
         typer.echo(_how_good(folder))
-        if experiment.initial_weights is None or experiment.data.validation_share == 0:
+        if experiment.initial_weights in UNTRAINED or experiment.data.validation_share == 0:
             return
         try:
             rows = depth_before_and_after(experiment, folder, device, progress)
@@ -172,8 +172,7 @@ def evaluate_depth(
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
     from erfsfm.evaluation.eigen import eigen_protocol
-    from erfsfm.evaluation.many_view_truth import many_view_protocol
-    from erfsfm.evaluation.protocols import depth_protocol
+    from erfsfm.evaluation.protocols import depth_protocol, many_view_protocol, named_recordings
     from erfsfm.inference import DepthPosePredictor
 
     if truth == "many-views" and split is not None:
@@ -188,7 +187,8 @@ def evaluate_depth(
     networks = {name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)}
     with progress_bar() as show:
         if truth == "many-views":
-            rows = many_view_protocol(networks["networks"], dataset[0], sequence or (), cache, allow_leak, show)
+            parts = [part for name in sequence or [""] for part in named_recordings(dataset[0], name)]
+            rows = many_view_protocol(networks["networks"], parts, cache, allow_leak, show)
         elif split is None:
             rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
         else:
@@ -259,7 +259,7 @@ def predict(
     import cv2
     import numpy as np
 
-    from erfsfm.common.files import write_array, write_atomically
+    from erfsfm.common.files import write_atomically
     from erfsfm.common.readers.images import list_images, read_image, report_unreadable
     from erfsfm.inference import DepthPosePredictor, colour_disparity
 
@@ -286,7 +286,7 @@ def predict(
             continue
         output.mkdir(parents=True, exist_ok=True)
         depth = predictor.depth(image)
-        write_array(depth_file, partial(np.save, arr=depth))
+        write_atomically(depth_file, partial(np.save, arr=depth))
         picture = cv2.imencode(".png", colour_disparity(depth)[..., ::-1])[1]
         write_atomically(depth_file.with_suffix(".png"), bytes(picture))
     report_unreadable(unreadable, len(files), "images")

@@ -16,6 +16,8 @@ Fidelity = Literal["default", "paper"]
 NetworkKind = Literal["depth", "pose"]
 TrainedNetworks = Literal["both", "depth", "pose"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
+EIGEN = "eigen"  # names the test scenes of Eigen et al., and the shipped split with their frames
+UNTRAINED = ("imagenet", "none")  # initial weights that no training of ours wrote
 _COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
 
 
@@ -58,8 +60,9 @@ class DataConfig(Section):
         description="frames to train on by recording, e.g. {kitti_odometry/00: '0:250'}; empty: all",
     )
     exclude: list[str] = Field(
-        default_factory=lambda: ["kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"],
-        description="recordings or frames never trained on, also where a KITTI raw drive holds the same frames",
+        default_factory=lambda: ["kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10", EIGEN],
+        description="recordings or frames never trained on, also where a KITTI raw drive holds the same frames; eigen: "
+        "the 28 test scenes of Eigen et al. among KITTI raw drives",
     )
     validation: list[str] = Field(
         default_factory=lambda: ["simulated/500-599"],
@@ -73,20 +76,11 @@ class DataConfig(Section):
         default=None,
         description="file of the recordings to train, validate and test on, or the name of one in configs/splits",
     )
-    leave_out: Literal["eigen", "none"] = Field(
-        default="eigen", description="KITTI raw drives never trained on: the 28 test scenes of Eigen et al."
-    )
-    static_frames: Literal["remove", "keep"] = Field(
-        default="remove",
-        description="frames of KITTI raw and own recordings in which the camera stands still, by GPS/IMU, else "
-        "by image differences",
-    )
     weights: dict[str, Annotated[float, Field(gt=0)]] = Field(
         default_factory=dict,
         description="relative number of samples by prefix of the recording, e.g. {simulated: 1, kitti: 1}; "
         "empty: by number of frames",
     )
-    validation_snippets: int = Field(default=60, ge=1, description="number of snippets in each validation")
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
     zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
     roll: float = Field(
@@ -117,12 +111,10 @@ class LossConfig(Section):
         default=0.0, ge=0, le=1, description="weight of SSIM in the photometric error; 0: L1 alone"
     )
     reduction: Literal["mean", "minimum"] = Field(
-        default="mean", description="over source frames; minimum tolerates occlusion (Godard et al. 2019)"
+        default="mean",
+        description="over source frames; minimum tolerates occlusion, and masks pixels whose error is smaller without "
+        "warping (Godard et al. 2019)",
     )
-    auto_mask: bool = Field(
-        default=False, description="mask pixels whose error is smaller without warping (Godard et al. 2019)"
-    )
-    scales: int = Field(default=4, ge=1, le=4, description="pyramid levels of the photometric error")
     smoothness: Literal["depth-second-order", "disparity-edge-aware"] = Field(
         default="depth-second-order", description="smoothed quantity and order of its derivative"
     )
@@ -215,7 +207,6 @@ class TrainingConfig(Section):
     gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
     validate_every: int = Field(default=1000, ge=1, description="steps between validations")
     checkpoint_every: int = Field(default=500, ge=1, description="steps between checkpoints")
-    log_every: int = Field(default=50, ge=1, description="steps between log entries")
     precision: Precision = Field(
         default="32-true",
         description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, and 32-true if it has no bfloat16, "
@@ -236,10 +227,11 @@ class ExperimentConfig(Section):
     loss: LossConfig = Field(default_factory=LossConfig)
     teacher: TeacherConfig = Field(default_factory=TeacherConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
-    pretrained: Literal["imagenet", "none"] = Field(
-        default="imagenet", description="what the encoder of a lite0 network starts from, without initial_weights"
+    initial_weights: str = Field(
+        default="imagenet",
+        description="weights to start from, whose presets may differ; imagenet: the encoder of a lite0 network alone, "
+        "where depth is not among the weights; none: nothing",
     )
-    initial_weights: str | None = Field(default=None, description="weights to start from; presets may differ")
 
     def with_roots(self, roots: Sequence[Path]) -> Self:
         """The same experiment on further data sets."""

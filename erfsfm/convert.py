@@ -77,8 +77,17 @@ def convert(
         networks[network.kind] = network
     if dilated and "pose" not in networks:
         raise CheckpointError("dilated needs a pose network: the reference's dilated DispNetS cannot run")
+    settings: dict[str, Any] = {"fidelity": "paper", "height": size[0], "width": size[1]}
+    for kind, network in networks.items():
+        settings |= {kind: network.preset, f"{kind}_width": network.width}
+    if "pose" in networks:
+        settings |= {"sources": networks["pose"].sources}
+    try:
+        config = NetworkConfig.model_validate(settings)
+    except ValidationError as error:
+        raise CheckpointError(f"no network of ours has such layers: {first_problem(error)}") from error
     record = ModelRecord(
-        network=_config(networks, size),
+        network=config,
         networks="both" if len(networks) == 2 else next(iter(networks)),
         trained_on=list(trained_on) or ["unknown"],
         licence="unknown: ask the authors of the weights",
@@ -152,7 +161,10 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
         elif decoder and kind == "pose":
             continue  # explainability masks: only training would need them
         elif decoder:
-            renamed[_decoder_name(decoder["block"], int(decoder["level"]), decoder["rest"])] = value
+            # our lists run from the coarsest level to the finest; the old names count from the finest
+            block, level, rest = decoder["block"], int(decoder["level"]), decoder["rest"]
+            head = f"heads.{4 - level}.{rest.removeprefix('0.')}"
+            renamed[head if block == "predict_disp" else f"{block}s.{7 - level}.{rest}"] = value
         elif name.startswith("pose_pred."):
             renamed[name.replace("pose_pred.", "pose_head.", 1)] = value
         else:
@@ -167,13 +179,6 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
             ours = _deformable(f"{path}: conv{stage}.{place}", parts)
         renamed |= {f"{prefix}.{rest}": value for rest, value in ours.items()}
     return renamed, tuple(sorted(stages))
-
-
-def _decoder_name(block: str, level: int, rest: str) -> str:
-    """Our lists run from the coarsest level to the finest; the old names count from the finest."""
-    if block == "predict_disp":
-        return f"heads.{4 - level}.{rest.removeprefix('0.')}"
-    return f"{block}s.{7 - level}.{rest}"
 
 
 def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -200,15 +205,3 @@ def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     if len(found) != 5:
         raise CheckpointError(f"{where} must hold offsets, modulator and kernel; found {', '.join(sorted(parts))}")
     return found
-
-
-def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -> NetworkConfig:
-    settings: dict[str, Any] = {"fidelity": "paper", "height": size[0], "width": size[1]}
-    for kind, network in networks.items():
-        settings |= {kind: network.preset, f"{kind}_width": network.width}
-    if "pose" in networks:
-        settings |= {"sources": networks["pose"].sources}
-    try:
-        return NetworkConfig.model_validate(settings)
-    except ValidationError as error:
-        raise CheckpointError(f"no network of ours has such layers: {first_problem(error)}") from error

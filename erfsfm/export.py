@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ExportError
 from erfsfm.common.files import refuse_foreign, write_atomically
-from erfsfm.common.threads import open_session
+from erfsfm.common.processes import open_session
 from erfsfm.config import NetworkKind
 from erfsfm.networks.torch_network import exported
 
@@ -84,7 +84,20 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
         inputs, output = (["image"], "disparity") if kind == "depth" else (["target", "sources"], "T_source_target")
         given = [dict(zip(inputs, example)) for example in examples]
         graph = exported(network.eval(), [*given[0].values()], inputs, [output])
-        content = _with_metadata(graph, kind, preset, model)
+        described = onnx.load_model_from_string(graph)
+        onnx.checker.check_model(described)
+        record = model.record
+        notes = {
+            "network": preset,
+            "kind": kind,
+            "fidelity": config.fidelity,
+            "input": "RGB in [-1, 1]",
+            "licence": record.licence,
+            "trained_on": json.dumps(record.trained_on),
+            _MARK: record.version,
+        }
+        onnx.helper.set_model_props(described, notes)
+        content = described.SerializeToString()
         difference = max(_difference(network, content, each) for each in given)
         if not difference <= TOLERANCE:
             raise ExportError(
@@ -94,25 +107,6 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
         write_atomically(file, content)
         files.append(Exported(file, kind, preset, difference))
     return files
-
-
-def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model) -> bytes:
-    """The checked graph with metadata: preset, fidelity, input range, licence and training data."""
-    graph = onnx.load_model_from_string(content)
-    onnx.checker.check_model(graph)
-    record = model.record
-    notes = {
-        "network": preset,
-        "kind": kind,
-        "fidelity": record.network.fidelity,
-        "input": "RGB in [-1, 1]",
-        "licence": record.licence,
-        "trained_on": json.dumps(record.trained_on),
-        _MARK: record.version,
-    }
-    onnx.helper.set_model_props(graph, notes)
-    serialised: bytes = graph.SerializeToString()
-    return serialised
 
 
 def _difference(network: nn.Module, content: bytes, inputs: dict[str, Tensor]) -> float:

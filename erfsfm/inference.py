@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from erfsfm.common.errors import CheckpointError, ConfigError
+from erfsfm.common.errors import CheckpointError, ConfigError, DataError
+from erfsfm.common.processes import usable_cores
+from erfsfm.common.readers.camera_file import MOST_PIXELS
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.common.readers.images import resize_image
-from erfsfm.common.readers.pinhole import MOST_PIXELS
-from erfsfm.common.threads import usable_cores
 from erfsfm.config import NetworkKind
 from erfsfm.model_record import ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
@@ -236,6 +236,23 @@ class DepthPosePredictor:
         if not np.isfinite(output).all():
             raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
         return output
+
+
+def refuse_leak(networks: DepthPosePredictor, names: Sequence[str], allow_leak: bool) -> bool:
+    """Whether some of the frames were trained on; ``DataError`` where that was not allowed."""
+    leaked = networks.leaks(names)
+    if leaked and not allow_leak:
+        some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")
+        raise DataError(f"leak: these weights were trained on {some}; choose other weights or data, or --allow-leak")
+    return bool(leaked)
+
+
+def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """``(H, W)``, unscaled, of an image ``(H, W, 3)``, by networks that this process reads once."""
+    return np.reciprocal(_predictor(weights).depth(image))
+
+
+_predictor = lru_cache(maxsize=1)(partial(DepthPosePredictor.from_weights, device="cpu", runtime="onnx"))
 
 
 def _input(image: NDArray[np.uint8] | Array, height: int, width: int) -> Array:

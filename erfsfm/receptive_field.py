@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
-from torch import Tensor
 
 from erfsfm.checkpoint import Model
 from erfsfm.common.errors import ConfigError
@@ -168,8 +167,19 @@ def _row(
     size = (height, width)
     pushed = offsets_px if any(layer.deformable for layer in probe.encoder.layers()) else 0.0
     seen = measured(probe, size, offsets_px=pushed)
-    network, weights = _with_weights(name, fidelity, learned)
-    weighed = field_of(network.encoder.eval().to(device), _encoder_input(snippet, network).to(device))
+    network, weights = build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
+    if learned is not None:  # where they are of this preset
+        title, model = learned
+        config, kind = model.record.network, PRESETS[name].kind
+        trained = model.networks.get(kind)
+        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
+            network, weights = trained, title
+    # the middle image ``(1, C, H, W)`` in [-1, 1], for a pose network with its sources behind it
+    sources, middle = network.input_channels // 3 - 1, len(snippet) // 2
+    around = [i for i in range(middle - sources // 2, middle + (sources + 1) // 2 + 1) if i != middle]
+    images = np.stack([snippet[i] for i in (middle, *around)]).transpose(0, 3, 1, 2).reshape(1, -1, *size)
+    shown = torch.from_numpy(images).float() / 127.5 - 1
+    weighed = field_of(network.encoder.eval().to(device), shown.to(device))
     summary = {
         "name": name,
         "fidelity": fidelity,
@@ -187,45 +197,21 @@ def _row(
     return FieldRow(title, summary, theoretical_corner(probe, seen.pixel, pushed), seen, weighed)
 
 
-def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | None) -> tuple[Network, str]:
-    """The learned network if it is of this preset, else a fresh one."""
-    if learned is not None:
-        title, model = learned
-        config, kind = model.record.network, PRESETS[name].kind
-        trained = model.networks.get(kind)
-        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
-            return trained, title
-    return build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
-
-
-def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Tensor:
-    """``(1, C, H, W)`` in [-1, 1]: the middle image, for a pose network with its sources behind it."""
-    sources = network.input_channels // 3 - 1
-    middle = len(snippet) // 2
-    around = [i for i in range(middle - sources // 2, middle + (sources + 1) // 2 + 1) if i != middle]
-    images = np.stack([snippet[middle], *(snippet[i] for i in around)])
-    stacked = torch.from_numpy(images).permute(0, 3, 1, 2)  # (1 + N, 3, H, W)
-    return stacked.reshape(1, -1, *images.shape[1:3]).float() / 127.5 - 1
-
-
 def street_snippet(frames: int, height: int, width: int) -> list[NDArray[np.uint8]]:
     """Consecutive views ``(height, width, 3)`` uint8 RGB of a straight drive between walls, a metre a frame."""
-    return [_view(height, width, float(k)) for k in range(frames)]
-
-
-def _view(height: int, width: int, z_m: float) -> NDArray[np.uint8]:
     v, u = np.mgrid[:height, :width]
     ray_x = (u - (width - 1) / 2) / (_FOCAL_SHARE * width)
     ray_y = (v - (height - 1) / 2) / (_FOCAL_SHARE * width)
     to_road = _HEIGHT_M / np.maximum(ray_y, 1e-6)  # z-depth in metres
     to_wall = _HALF_WIDTH_M / np.maximum(np.abs(ray_x), 1e-6)
     depth = np.minimum(to_road, to_wall)
-    x, y, z = ray_x * depth, ray_y * depth, z_m + depth
-    wall = to_wall < to_road
-    lane = (np.abs(np.abs(x) - 2) < 0.12) & (np.mod(z, 6) < 3)
-    window = (np.mod(z, 3) < 1.2) & (np.mod(y, 2.5) < 1.3)
-    across = np.where(wall, y, x)
-    grain = np.mean([np.sin(a * across + b * z + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9))], axis=0)
-    shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * grain
-    shade = np.where(wall & (y < -6), 0.92, shade / (1 + depth / 300))  # sky above the walls
-    return np.repeat(np.rint(255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+    x, y, wall = ray_x * depth, ray_y * depth, to_wall < to_road
+    across, views = np.where(wall, y, x), []
+    for z in (z_m + depth for z_m in range(frames)):
+        lane = (np.abs(np.abs(x) - 2) < 0.12) & (np.mod(z, 6) < 3)
+        window = (np.mod(z, 3) < 1.2) & (np.mod(y, 2.5) < 1.3)
+        grain = np.mean([np.sin(a * across + b * z + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9))], axis=0)
+        shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * grain
+        shade = np.where(wall & (y < -6), 0.92, shade / (1 + depth / 300))  # sky above the walls
+        views.append(np.repeat(np.rint(255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=2))
+    return views

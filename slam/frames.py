@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.readers.pinhole import Pinhole
+from erfsfm.common.readers.camera_file import Pinhole
 from slam.geometry.se3 import FloatArray, invert
 
 T = TypeVar("T")

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from benchmarking import handheld, page, pairs
+from benchmarking import handheld, page
 from benchmarking import runs as p
 from benchmarking.metrics import rows
 from shared.command import one_line_errors, parser_of
@@ -108,7 +108,7 @@ def _compare_speed(options: argparse.Namespace, command: str) -> None:
     runs.mkdir(parents=True)
     checkouts = zip(("before", "after"), (options.against.resolve(), p.ROOT))
     named = {f"{when} ({p.revision(checkout)})": checkout for when, checkout in checkouts}
-    text = pairs.tables(pairs.in_turn(named, drives, options.pairs, runs))
+    text = p.tables(p.in_turn(named, drives, options.pairs, runs))
     _write_section(options, page.speed_section(command, text))
     print(text)
 

@@ -104,7 +104,13 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 def pages() -> dict[str, str]:
     """The Markdown of the pages that are not in docs/, by their place in the site."""
-    elsewhere = {place: _text(ROOT / source) for source, place in PLACES.items()}
+    elsewhere = {}
+    for source, place in PLACES.items():
+        elsewhere[place] = text = (ROOT / source).read_text(encoding="utf-8")
+        if source.endswith(".ipynb"):
+            cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
+            parts = [text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in cells]
+            elsewhere[place] = "\n\n".join(parts)
     return elsewhere | {"command-line.md": command_line(), "python.md": interface()}
 
 
@@ -129,14 +135,6 @@ def interface() -> str:
             options = f"    options: {{members: {MEMBERS[name]}}}\n" if name in MEMBERS else ""
             text += f"\n::: {module}.{name}\n{options}"
     return text
-
-
-def _text(path: Path) -> str:
-    text = path.read_text(encoding="utf-8")
-    if path.suffix != ".ipynb":
-        return text
-    cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
-    return "\n\n".join(source if kind == "markdown" else f"```python\n{source}\n```" for kind, source in cells)
 
 
 if __name__ == "__main__":

@@ -88,7 +88,9 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
     with rc_context(STYLE):
         figure = Figure(figsize=(7.4, 5.6), layout="constrained")
         draw_trajectories(figure, trajectories, "m")
-        left = _raster(figure, WIDTH_PX // 2)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        left = narrowed(np.asarray(canvas.buffer_rgba())[..., :3], WIDTH_PX // 2)
     right = above(thinned_mesh(folder.require(MAP_MESH), MOST_TRIANGLES), WIDTH_PX - WIDTH_PX // 2)
     height = max(left.shape[0], right.shape[0])
     bottom = np.concatenate([_padded(left, height), _padded(right, height)], axis=1)
@@ -137,13 +139,6 @@ def cast(mesh: MapMesh, origins: FloatArray, directions: FloatArray) -> NDArray[
     mixed = np.einsum("pc,pcr->pr", np.stack([1.0 - u - v, u, v], axis=1), corners)
     picture[reached] = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
     return picture
-
-
-def _raster(figure: Figure, width: int) -> NDArray[np.uint8]:
-    """A figure as pixels of a given width."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return narrowed(np.asarray(canvas.buffer_rgba())[..., :3], width)
 
 
 def _padded(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:

@@ -67,6 +67,7 @@ def main() -> None:
                 f"{file.name} has {size:.1f} MB; shipped weights have at most {LARGEST_MB}: train narrower"
             )
     network = record.network
+    measured = json.loads(arguments.metrics.read_text()) if arguments.metrics else [record.metrics]
     card = CARD.format(
         name=arguments.name,
         **network.model_dump(),
@@ -80,7 +81,7 @@ def main() -> None:
         licence=record.licence,
         note=arguments.note,
         evaluation=arguments.evaluation,
-        metrics=_table(arguments.metrics, record.metrics),
+        metrics=table_of(measured).markdown(),
     )
     (folder / "README.md").write_text(card)
     print(f"{folder}: read {folder / 'README.md'}")
@@ -98,11 +99,6 @@ def averaged(models: list[Model]) -> Model:
         network.load_state_dict(mean)
     seen = merge([name for each in models for name in each.record.trained_on])
     return Model(model.record.model_copy(update={"trained_on": seen}), model.networks)
-
-
-def _table(path: Path | None, fallback: dict[str, float]) -> str:
-    rows = json.loads(path.read_text()) if path else [fallback]
-    return table_of(rows).markdown()
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from __future__ import annotations
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -177,69 +177,53 @@ def row(name: str, drive: Drive, camera: FrameSequence, weights: str, keep: Path
     return [name, f"{percent:.1f}", f"{metrics.confidence.run or 0.0:.2f}", "; ".join(said)]
 
 
-@dataclass(frozen=True)
-class Outcomes:
-    """Of run folders that have a truth and metres: largest contradictions ``(N,)`` in sigmas, and which are right."""
+def outcomes(runs: Path) -> tuple[NDArray[np.str_], FloatArray, NDArray[np.bool_]]:
+    """Of run folders with a truth and metres: names, largest contradictions ``(N,)`` in sigmas, and which are right."""
+    found: list[tuple[str, float, bool]] = []
+    for path in sorted(runs.iterdir()):
+        metrics = RunFolder(path).metrics()
+        ate_m, length_m = metrics.trajectories.optimised.align.dof6.ate_rmse_m, metrics.sequence.length_m
+        if ate_m is not None and length_m and metrics.is_metric and metrics.tracking.absent:
+            sigmas = max(each.sigmas or 0.0 for each in metrics.agreement or ())
+            found.append((path.name, sigmas, ate_m / length_m <= RIGHT))
+    names, sigmas_of, right = zip(*found)
+    return np.array(names), np.array(sigmas_of), np.array(right)
 
-    names: list[str]
-    sigmas: FloatArray
-    right: NDArray[np.bool_]
 
-    @classmethod
-    def of(cls, runs: Path) -> Outcomes:
-        """The run folders in a folder."""
-        found: list[tuple[str, float, bool]] = []
-        for path in sorted(runs.iterdir()):
-            metrics = RunFolder(path).metrics()
-            ate_m, length_m = metrics.trajectories.optimised.align.dof6.ate_rmse_m, metrics.sequence.length_m
-            if ate_m is not None and length_m and metrics.is_metric and metrics.tracking.absent:
-                sigmas = max(each.sigmas or 0.0 for each in metrics.agreement or ())
-                found.append((path.name, sigmas, ate_m / length_m <= RIGHT))
-        names, sigmas_of, right = zip(*found)
-        return cls(list(names), np.array(sigmas_of), np.array(right))
+def constants(sigmas: FloatArray, right: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """With the likeliest sigmas that halve the confidence; too few drives lie between to fit the other two."""
+    best, _, steepness = CONFIDENCE
 
-    def chosen(self, rows: NDArray[np.bool_]) -> Outcomes:
-        """Some of them."""
-        return Outcomes([name for name, row in zip(self.names, rows) if row], self.sigmas[rows], self.right[rows])
+    def loss(half: float) -> float:
+        share = share_right(sigmas, (best, half, steepness))
+        return -float(np.log(np.where(right, share, 1.0 - share)).sum())
 
-    def constants(self) -> tuple[float, float, float]:
-        """With the likeliest sigmas that halve the confidence; too few drives lie between to fit the other two."""
-        best, _, steepness = CONFIDENCE
-
-        def loss(half: float) -> float:
-            share = share_right(self.sigmas, (best, half, steepness))
-            return -float(np.log(np.where(self.right, share, 1.0 - share)).sum())
-
-        return best, float(minimize_scalar(loss, bounds=(1.0, 5.0), method="bounded").x), steepness
-
-    def table(self, stated: FloatArray) -> Iterator[list[str]]:
-        """Runs by their stated confidence ``(N,)``: how many, the mean of it, and how many are right."""
-        for least, most in pairwise(BINS):
-            among = (stated >= least) & (stated < most)
-            shares = [f"{part[among].mean():.2f}" if among.any() else "-" for part in (stated, self.right)]
-            yield [f"{least:g} to {most:g}", str(among.sum()), *shares]
+    return best, float(minimize_scalar(loss, bounds=(1.0, 5.0), method="bounded").x), steepness
 
 
 def judge_confidence(runs: Path) -> None:
     """Print what the confidence of runs is worth on drives left out, and the constants that all of them give."""
-    every = Outcomes.of(runs)
-    told_right = np.array([FOCAL not in name for name in every.names])
-    known = every.chosen(told_right)
-    drives = np.array([re.split(r"[\[,]", name)[0] for name in known.names])
+    names, every_sigmas, every_right = outcomes(runs)
+    told_right = np.array([FOCAL not in name for name in names])
+    sigmas, right = every_sigmas[told_right], every_right[told_right]
+    drives = np.array([re.split(r"[\[,]", name)[0] for name in names[told_right]])
     stated = np.zeros(len(drives))
     for drive in np.unique(drives):
         held_out = drives == drive
-        stated[held_out] = share_right(known.sigmas[held_out], known.chosen(~held_out).constants())
-    print(Table(("confidence by the other drives", "runs", "mean", "share right"), [*known.table(stated)]).markdown())
-    constant = np.full(len(drives), known.right.mean())
-    scores = [
-        np.square(each - known.right).mean() for each in (stated, share_right(known.sigmas, CONFIDENCE), constant)
-    ]
+        stated[held_out] = share_right(sigmas[held_out], constants(sigmas[~held_out], right[~held_out]))
+    rows = []
+    for least, most in pairwise(BINS):
+        among = (stated >= least) & (stated < most)
+        shares = [f"{part[among].mean():.2f}" if among.any() else "-" for part in (stated, right)]
+        rows.append([f"{least:g} to {most:g}", str(among.sum()), *shares])
+    print(Table(("confidence by the other drives", "runs", "mean", "share right"), rows).markdown())
+    constant = np.full(len(drives), right.mean())
+    scores = [np.square(each - right).mean() for each in (stated, share_right(sigmas, CONFIDENCE), constant)]
     print("Brier score {:.3f} by the other drives, {:.3f} as in use, {:.3f} of a constant".format(*scores))
-    print(f"best, half and steepness {known.constants()} by all drives, {CONFIDENCE} in use")
-    for name, sigmas, right in zip(every.names, every.sigmas, every.right):
+    print(f"best, half and steepness {constants(sigmas, right)} by all drives, {CONFIDENCE} in use")
+    for name, one, is_right in zip(names, every_sigmas, every_right):
         if FOCAL in name:
-            print(f"{name}: {'right' if right else 'wrong'}, {share_right(sigmas, CONFIDENCE):.2f}")
+            print(f"{name}: {'right' if is_right else 'wrong'}, {share_right(one, CONFIDENCE):.2f}")
 
 
 @one_line_errors()

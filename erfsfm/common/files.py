@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 from erfsfm.common.errors import BusyError, ConfigError, OneLineError
 
@@ -58,16 +58,6 @@ def write_atomically(path: Path, content: str | bytes | Callable[[Path], object]
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-
-
-def write_array(path: Path, save: Callable[[BinaryIO], None], sync: bool = True) -> None:
-    """As `write_atomically`, by a function of NumPy, which would add a suffix to a path."""
-
-    def fill(partial: Path) -> None:
-        with partial.open("wb") as file:
-            save(file)
-
-    write_atomically(path, fill, sync)
 
 
 def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) -> None:
@@ -121,15 +111,11 @@ def save_figure(figure: Figure, path: Path, dpi: int) -> None:
 class FolderLock(ExitStack):
     """Folders held until the end of a block, or of the process, however it ends; nothing is left in them."""
 
-    def take(self, folder: Path) -> None:
-        """Hold a folder, which is made; without effect where the file system has no locks, or no folder can be made."""
-        self._lock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    def take(self, folder: Path, waits: bool = False) -> None:
+        """Hold a folder, which is made; without effect where the file system has no locks, or no folder can be made.
 
-    def wait_for(self, folder: Path) -> None:
-        """Hold a folder as soon as no other process does; else as `take`."""
-        self._lock(folder, fcntl.LOCK_EX)
-
-    def _lock(self, folder: Path, how: int) -> None:
+        Where another process holds it, this one ``waits`` for its end, or is refused.
+        """
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
         if not folder.is_dir():
@@ -137,7 +123,7 @@ class FolderLock(ExitStack):
         descriptor = os.open(folder, os.O_RDONLY)
         self.callback(os.close, descriptor)
         try:
-            fcntl.flock(descriptor, how)
+            fcntl.flock(descriptor, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise BusyError(f"another process writes to {folder}: wait, or choose another --output") from error
         except OSError:  # no locks here

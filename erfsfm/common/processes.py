@@ -1,4 +1,4 @@
-"""Work in other processes: spread over several of this program, or a run of the SLAM system."""
+"""Work in other processes and threads, a run of the SLAM system as a process, and the threads that libraries start."""
 
 from __future__ import annotations
 
@@ -8,14 +8,22 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import cv2
+from threadpoolctl import threadpool_limits
 
 from erfsfm.common.errors import TrainingError
-from erfsfm.common.threads import stay_single_threaded
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
 
 _POLL_S = 0.5
 _GIB = 2**30
@@ -91,3 +99,79 @@ def _watch(process: subprocess.Popen[bytes], memory_gib: float) -> str:
                 used = pages * os.sysconf("SC_PAGE_SIZE") / _GIB
             if 0 < memory_gib < used:
                 return f"it used {used:.1f} GiB of memory, more than the {memory_gib:.1f} GiB of --memory"
+
+
+S = TypeVar("S")
+T = TypeVar("T")
+
+CORES = 2  # used side by side
+_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
+
+
+def usable_cores() -> int:
+    """Those that this process may run on, or what ``OMP_NUM_THREADS`` says, as PyTorch counts them."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdecimal() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def opencv_threads(count: int) -> Iterator[None]:
+    """OpenCV computes in so many threads; with one, in the calling thread alone.
+
+    Its threads also have to end before a process is forked: the child would wait forever for threads that it lacks.
+    """
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(count)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def stay_single_threaded() -> None:
+    """Start no threads in this process from here on, which is one of as many as there are cores."""
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when other libraries are loaded, and by `usable_cores`
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
+
+
+@contextmanager
+def limit_library_threads() -> Iterator[None]:
+    """OpenCV and BLAS compute in the calling threads alone, for programs that run several threads of their own."""
+    with opencv_threads(1), threadpool_limits(1, "blas"):
+        yield
+
+
+def open_session(content: bytes, threads: int) -> InferenceSession:
+    """A graph that is ready to run on that many threads; the exceptions of ONNX Runtime are raised as they are."""
+    from onnxruntime import InferenceSession, SessionOptions
+
+    options = SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _FATAL
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # costly on a shared machine
+    return InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def read_ahead(read: Callable[[int], T], numbers: Sequence[int], threads: int = 1) -> Generator[T, None, None]:
+    """The result of ``read`` for each number, computed in other ``threads`` while the one before is used.
+
+    They end with the numbers, or when the generator is closed. With more than one, calls must be independent.
+    """
+    with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="ahead") as ahead:
+        waiting: deque[Future[T]] = deque()
+        for number in numbers:
+            waiting.append(ahead.submit(read, number))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        for last in waiting:
+            yield last.result()
+
+
+def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
+    """The result of ``do`` for each item, in order; the calls must be independent."""
+    with ThreadPoolExecutor(max_workers=CORES, thread_name_prefix="side") as side:
+        return list(side.map(do, items))

@@ -22,11 +22,24 @@ def progress_bar() -> Iterator[Progress]:
     if sys.stderr is None:
         yield silent
     elif sys.stderr.isatty():
-        with _bars() as update:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bars
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        tasks: dict[str, Any] = {}
+        with Bars(*columns, console=Console(stderr=True)) as bars:
+
+            def update(stage: str, done: int, total: int) -> None:
+                name = _name(stage)
+                if name not in tasks:
+                    tasks[name] = bars.add_task(stage, total=total)
+                bars.update(tasks[name], completed=done, description=stage)
+
             yield update
     else:
-        with progress_lines(lambda line: sys.stderr.write(f"{line}\n")) as update:
-            yield update
+        with progress_lines(lambda line: sys.stderr.write(f"{line}\n")) as lines:
+            yield lines
 
 
 @contextmanager
@@ -56,25 +69,6 @@ def duration(seconds: float) -> str:
     if hours >= 48:
         return f"{hours / 24:.1f} days"
     return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {round(seconds) % 60} s"
-
-
-@contextmanager
-def _bars() -> Iterator[Progress]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bars
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    tasks: dict[str, Any] = {}
-    with Bars(*columns, console=Console(stderr=True)) as bars:
-
-        def update(stage: str, done: int, total: int) -> None:
-            name = _name(stage)
-            if name not in tasks:
-                tasks[name] = bars.add_task(stage, total=total)
-            bars.update(tasks[name], completed=done, description=stage)
-
-        yield update
 
 
 def _name(stage: str) -> str:

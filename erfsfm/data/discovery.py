@@ -29,7 +29,7 @@ from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_number
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos, video_name
 from erfsfm.data.prepared import INDEX_FILE, read_prepared
 from erfsfm.data.recordings import Recording, Video, split_at_gaps
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 INDOOR_HEIGHT_M = 0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
 _COLOUR = (2, 3)
@@ -75,7 +75,10 @@ def _recordings_at(root: Path) -> list[Recording]:
 def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
     """The cameras of a sequence in parts without gaps."""
     folders = {c: folder for c in ODOMETRY_CAMERAS if (folder := sequence / f"image_{c}").is_dir()}
-    poses = root.base / "poses" / f"{sequence.name}.txt"
+    poses, written = root.base / "poses" / f"{sequence.name}.txt", root.base / CAMERA_FILE
+    height_m: float | None = None  # of the camera in a simulated world, in rooms a constant; unknown in a real root
+    if root.simulation_seed() is not None and written.is_file():
+        height_m = read_camera_file(written).height_or(None) or INDOOR_HEIGHT_M
     recordings = []
     for camera, files, (height, width) in _cameras(folders):
         calibration, row = CalibrationFile(sequence / ODOMETRY_CALIBRATION), f"P{camera}"
@@ -88,19 +91,12 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
             Camera.of(pinhole),
             depth=depth if camera == ODOMETRY_CAMERAS[0] and all(path.is_file() for path in depth) else None,
             poses_file=poses if poses.is_file() else None,
-            camera_height_m=_simulated_height(root),
+            camera_height_m=height_m,
             t_camera_cam0=(tx, ty, tz),
             sequence=sequence.name,
         )
         recordings += split_at_gaps(whole, files)
     return recordings
-
-
-def _simulated_height(root: OdometryRoot) -> float | None:
-    """The camera's height in a simulated world, in rooms `INDOOR_HEIGHT_M`; None in a real root."""
-    file = root.base / CAMERA_FILE
-    simulated = root.simulation_seed() is not None and file.is_file()
-    return read_camera_file(file).height_or(None) or INDOOR_HEIGHT_M if simulated else None
 
 
 def open_drive(drive: Path) -> list[Recording]:
@@ -142,7 +138,11 @@ def _own(root: Path) -> list[Recording]:
     if written.is_distorted:
         raise DataError(f"{home / CAMERA_FILE} describes a distorted camera: undistort the images before training")
     camera = Camera.of(written.pinhole)
-    images = [] if is_video else _images(home)
+    images: list[Path] = []
+    if not is_video:  # those of a folder, or those of its one sub-folder of a usual name, or of the first that has any
+        usual = image_folder(home)
+        folders = [usual] if usual is not None else sorted(path for path in home.iterdir() if path.is_dir())
+        images = next((found for folder in folders if (found := list_images(folder))), [])
     if not images:
         videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
         return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
@@ -152,10 +152,3 @@ def _own(root: Path) -> list[Recording]:
     if all(path.is_file() for path in depth):  # as a depth camera measures it
         whole = replace(whole, depth=depth, camera_height_m=written.height_or(None) or INDOOR_HEIGHT_M)
     return split_at_gaps(whole, files)
-
-
-def _images(home: Path) -> list[Path]:
-    """The images of a folder, or those of its one sub-folder of a usual name, or of the first that has any."""
-    usual = image_folder(home)
-    folders = [usual] if usual is not None else sorted(path for path in home.iterdir() if path.is_dir())
-    return next((images for folder in folders if (images := list_images(folder))), [])

@@ -1,37 +1,37 @@
 """The many-view teacher of whole drives: poses by the SLAM system once a drive, then a label for every few frames.
 
 All of it is kept in a folder under a digest of the drive's images and camera, so that it is computed once. In a
-prepared folder a label is a small picture: bounds are rounded by a third of a sigma on average.
+prepared folder a label is a small picture: bounds are rounded by a third of a sigma on average. The networks' package
+does not import the SLAM system: what goes between them are a folder of images and a trajectory.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
-from erfsfm.common.files import FolderLock, write_array, write_atomically
-from erfsfm.common.processes import processes
+from erfsfm.common.files import FolderLock, write_atomically
+from erfsfm.common.processes import limit_library_threads, processes, slam_process
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
-from erfsfm.common.threads import limit_library_threads
-from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
-from erfsfm.data.window import TeacherStructure, snippet_motion
-from erfsfm.geometry.camera import Camera
-from erfsfm.labels.drive_poses import drive_poses
-from erfsfm.labels.many_views import NEIGHBOURS, in_camera_heights, label, refined_label, shrunk
-from erfsfm.mvs.flow import Grey, measure
-from erfsfm.mvs.views import neighbours_around
+from erfsfm.data.window import ArrayCache, TeacherStructure, snippet_motion
+from erfsfm.geometry import Camera
+from erfsfm.labels import NEIGHBOURS, in_camera_heights, label, measure, refined_label, shrunk
+from erfsfm.mvs.views import Grey, neighbours_around
 
 VERSION = 4
 # pixels of the images that flow alone measures: finer flow is slower and no surer; twice the networks' width would
@@ -39,6 +39,10 @@ VERSION = 4
 LARGEST_WIDTH = 800
 FINER = 2  # learned depth is refined at this many times the labels' size, where images have as many pixels
 LEAST_NEIGHBOURS = 2
+_FPS = 10.0
+_CAMERA_HEIGHT_M = 1.65  # any: poses are given in camera heights
+_TRAJECTORY = "trajectory_optimised.kitti.txt"
+_SETTINGS = ("mapping.enabled=false", "output.report=false")
 _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
 
@@ -99,13 +103,31 @@ class DriveLabels:
             raise TrainingError(f"the teacher's label {path} is damaged: delete it, start again ({error})") from error
 
     def measure_poses(self, weights: str) -> None:
-        """Run the SLAM system on the drive and keep its poses."""
-        recording, video = self.recording, self.recording.video
-        images: Iterable[Path | NDArray[np.uint8]] = recording.images
-        if video is not None:  # in order and at full size, which `Video` is not made for
-            frames = VideoFrames(video.path, counted_frames=0)
-            images = (frames.read(recording.start + index) for index in range(len(recording)))
-        T_world_camera = drive_poses(recording.frames_name, images, recording.camera, weights)
+        """Run the SLAM system on the drive and keep its poses; ``TrainingError`` without a trajectory or a scale."""
+        recording, name = self.recording, self.recording.frames_name
+        with tempfile.TemporaryDirectory(prefix="erfsfm-teacher-") as temporary:
+            drive, output = Path(temporary) / "drive", Path(temporary) / "run"
+            drive.mkdir()
+            if recording.video is None:
+                for index, path in enumerate(recording.images):
+                    (drive / f"{index:06d}{path.suffix}").symlink_to(path.resolve())
+            else:  # in order and at full size, which `Video` is not made for
+                frames = VideoFrames(recording.video.path, counted_frames=0)
+                for index in range(len(recording)):
+                    cv2.imwrite(str(drive / f"{index:06d}.png"), frames.read(recording.start + index)[..., ::-1])
+            camera = asdict(recording.camera) | {"fps": _FPS, "camera_height_m": _CAMERA_HEIGHT_M}
+            (drive / "camera.yaml").write_text(yaml.safe_dump(camera))
+            words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights, "--device", "cpu"]
+            reason = slam_process([*words, *(word for setting in _SETTINGS for word in ("--set", setting))])
+            if reason or not (output / _TRAJECTORY).is_file():
+                raise TrainingError(f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}")
+            rows = np.loadtxt(output / _TRAJECTORY).reshape(-1, 3, 4)
+            mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
+        if mode != "camera-height":
+            raise TrainingError(f"the teacher's poses of {name} have no scale: no road was found (scale mode {mode})")
+        T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
+        T_world_camera[:, :3] = rows
+        T_world_camera[:, :3, 3] /= _CAMERA_HEIGHT_M
         write_atomically(self.weights_file, weights)
         self.keep_poses(T_world_camera)
 
@@ -121,7 +143,7 @@ class DriveLabels:
 
     def keep_poses(self, T_world_camera: NDArray[np.float64]) -> None:
         """Write the poses ``(N, 4, 4)`` of all frames."""
-        write_array(self.poses_file, partial(np.save, arr=T_world_camera))
+        write_atomically(self.poses_file, partial(np.save, arr=T_world_camera))
 
     def measure_labels(self, targets: Sequence[int], learned: Learned | None = None) -> int:
         """Measure and keep the labels of some frames; returns their number.
@@ -139,7 +161,7 @@ class DriveLabels:
                 for values in bounds
             )
             arrays = {"least": least, "most": most}
-            write_array(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
+            write_atomically(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
         return len(targets)
 
     def _bounds(self, target: int, learned: Learned | None) -> Bounds | None:
@@ -151,13 +173,14 @@ class DriveLabels:
         else:
             finer = FINER if camera.width > 1.5 * width else 1
             camera = camera.resized(finer * width, finer * height)
-        image, around = self._image(target, camera), self._around(target, camera)
+        before_and_after = [target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording)]
+        image, around = self._image(target, camera), self._greys(before_and_after, camera)
         if image is None or len(around) < LEAST_NEIGHBOURS:
             return None
         grey, K, motion = _grey(image), camera.K.astype(np.float64), self._motion(target, around)
         if learned is None:
             return label(grey, [*around.values()], K, motion)
-        inverse_depth = in_camera_heights(learned(image), measure(grey, [*around.values()], K, motion))
+        inverse_depth = in_camera_heights(learned(image), *measure(grey, [*around.values()], K, motion))
         if inverse_depth is None:
             return None
         frames = np.arange(len(self.recording))
@@ -167,10 +190,6 @@ class DriveLabels:
         if not others:
             return None
         return shrunk(*refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth), finer)
-
-    def _around(self, target: int, camera: Camera) -> dict[int, Grey]:
-        """Frames before and after."""
-        return self._greys([target + k for k in NEIGHBOURS if 0 <= target + k < len(self.recording)], camera)
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
@@ -223,7 +242,12 @@ class ManyViewTeacher:
             if recording.labels is not None:
                 drive = DriveLabels(recording, recording.labels, self._size, self._stride, True, recording.skipped)
             else:
-                drive = DriveLabels(recording, self._folder / _digest(recording), self._size, self._stride)
+                # of the camera, the names, sizes and times of the images, and the version of this file
+                stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
+                seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
+                seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
+                digest = hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
+                drive = DriveLabels(recording, self._folder / digest, self._size, self._stride)
             self._drives[recording.key] = drive
         return self._drives[recording.key]
 
@@ -244,12 +268,15 @@ class ManyViewTeacher:
         labels in a prepared folder.
         """
         with FolderLock() as lock:
-            lock.wait_for(self._folder)
+            lock.take(self._folder, waits=True)
             drives = [self.drive(recording) for recording in recordings]
             for drive in drives:
                 drive.require_weights(weights)
             without = [drive for drive in drives if not drive.poses_file.is_file()]
-            tasks = [each for drive in drives for each in _missing(drive, sources)] if self._with_depth else []
+            tasks: list[tuple[DriveLabels, list[int]]] = []
+            for drive in drives if self._with_depth else ():
+                missing = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
+                tasks += [(drive, missing[first : first + _CHUNK]) for first in range(0, len(missing), _CHUNK)]
             for drive in (*without, *(drive for drive, _ in tasks)):
                 if drive.compact:
                     raise TrainingError(
@@ -269,20 +296,6 @@ class ManyViewTeacher:
                     for future in as_completed(running):
                         done += future.result()
                         progress("teacher: depth", done, total)
-
-
-def _digest(recording: Recording) -> str:
-    """Of the camera, the names, sizes and times of the images, and the version of this file."""
-    stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
-    seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
-    seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
-    return hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
-
-
-def _missing(drive: DriveLabels, sources: int) -> list[tuple[DriveLabels, list[int]]]:
-    """Frames without a label yet, in portions."""
-    frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
-    return [(drive, frames[first : first + _CHUNK]) for first in range(0, len(frames), _CHUNK)]
 
 
 def _grey(image: NDArray[np.uint8]) -> Grey:
@@ -313,8 +326,10 @@ def encode(least: NDArray[np.floating], most: NDArray[np.floating]) -> bytes:
     steps = np.where(measured, np.maximum(np.floor(LEAST_SIGMA * 2**doublings / STEP), 1), 1)
     code = (low + high - 2 * np.log(SMALLEST)) / (2 * STEP)
     code = np.clip(np.rint(code / steps) * steps, 0, 255)
+    # an unknown pixel has the code of the known one left of it: small when compressed
+    known_before = np.maximum.accumulate(np.where(known, np.arange(least.shape[1]), 0), axis=1)
     picture = np.zeros((*least.shape, 3), np.uint8)
-    picture[..., 0], picture[..., 1] = kind, _continued(code.astype(np.uint8), known)
+    picture[..., 0], picture[..., 1] = kind, np.take_along_axis(code.astype(np.uint8), known_before, axis=1)
     return bytes(cv2.imencode(".webp", picture, _LOSSLESS)[1])
 
 
@@ -332,9 +347,3 @@ def decode(data: bytes) -> tuple[Bound, Bound]:
     ratio_most = np.where(bounded_above, np.exp(sigma), np.inf).astype(np.float32)
     kind, middle = picture[..., 0], value.astype(np.float32)[picture[..., 1]]
     return (middle * ratio_least[kind]).astype(np.float16), (middle * ratio_most[kind]).astype(np.float16)
-
-
-def _continued(code: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Unknown pixels with the code of the known pixel left of them: small when compressed."""
-    columns = np.where(known, np.arange(code.shape[1]), 0)
-    return np.asarray(np.take_along_axis(code, np.maximum.accumulate(columns, axis=1), axis=1))

@@ -20,13 +20,14 @@ from pydantic import Field
 
 from erfsfm.common.config_tree import Section, dump_yaml, read_model
 from erfsfm.common.errors import DataError
+from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import NetworkConfig
 from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher, encode
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import Snippet
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 INDEX_FILE = "prepared.yaml"
 _POSES, _LABELS = "poses.txt", "labels"  # of a recording: true poses of its camera (KITTI), and the teacher's
@@ -58,7 +59,25 @@ def _file(folder: Path, kind: Literal["images", "depth"], frame: int) -> Path:
 def read_prepared(root: Path) -> list[Recording]:
     """The recordings of a prepared folder; ``DataError`` where its index is damaged."""
     index = read_model(_Index, root / INDEX_FILE, DataError, "is damaged, prepare again")
-    return [_recording(root / f"{number:04d}", entry) for number, entry in enumerate(index.recordings)]
+    recordings = []
+    for place, entry in enumerate(index.recordings):
+        folder = root / f"{place:04d}"
+        numbers, poses = range(entry.start, entry.start + entry.frames), folder / _POSES
+        depth = tuple(path if (path := _file(folder, "depth", n)).is_file() else None for n in numbers)
+        recording = Recording(
+            entry.name,
+            tuple(_file(folder, "images", n) for n in numbers),
+            entry.camera,
+            depth=depth if any(depth) else None,
+            poses_file=poses if poses.is_file() else None,
+            camera_height_m=entry.camera_height_m,
+            start=entry.start,
+            stored=entry.frames,
+            without_stops=True,
+            labels=folder / _LABELS,
+        )
+        recordings.append(recording)
+    return recordings
 
 
 def write_prepared(
@@ -90,48 +109,34 @@ def write_prepared(
             folder = unfinished / f"{number:04d}"
             unreadable += _write_images(folder, recording, network)
             if number >= len(training):
-                _write_truth(folder, recording, middle)
+                depth_file = recording.depth[middle] if recording.depth else None
+                if depth_file is not None:  # of the middle frame, as it is stored
+                    written = _file(folder, "depth", recording.start + middle)
+                    write_atomically(written, depth_file.read_bytes(), sync=False)
+                if (T_world_camera := recording.true_poses()) is not None:
+                    np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
             elif recording.exact:
                 for index in range(len(recording)):
                     depth = np.rint(recording.shrunk_depth(index, network.height, network.width) * 256)
                     path = _file(folder, "depth", recording.start + index)
-                    _put(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]))
+                    write_atomically(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]), sync=False)
             elif teacher is not None:
                 _write_labels(teacher.drive(recording), folder / _LABELS, network)
         report_unreadable(unreadable, sum(map(len, recordings)), "images")
-        entries = _Index(recordings=[_entry(recording, network) for recording in recordings])
-        (unfinished / INDEX_FILE).write_text(dump_yaml(entries))
+        entries = [
+            _Entry(
+                name=recording.name,
+                start=recording.start,
+                frames=len(recording),
+                camera=recording.camera.resized(network.width, network.height, network.fidelity),
+                camera_height_m=recording.camera_height_m,
+            )
+            for recording in recordings
+        ]
+        (unfinished / INDEX_FILE).write_text(dump_yaml(_Index(recordings=entries)))
         unfinished.replace(output)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def _recording(folder: Path, entry: _Entry) -> Recording:
-    numbers = range(entry.start, entry.start + entry.frames)
-    depth = tuple(path if (path := _file(folder, "depth", n)).is_file() else None for n in numbers)
-    poses = folder / _POSES
-    return Recording(
-        entry.name,
-        tuple(_file(folder, "images", n) for n in numbers),
-        entry.camera,
-        depth=depth if any(depth) else None,
-        poses_file=poses if poses.is_file() else None,
-        camera_height_m=entry.camera_height_m,
-        start=entry.start,
-        stored=entry.frames,
-        without_stops=True,
-        labels=folder / _LABELS,
-    )
-
-
-def _entry(recording: Recording, network: NetworkConfig) -> _Entry:
-    return _Entry(
-        name=recording.name,
-        start=recording.start,
-        frames=len(recording),
-        camera=recording.camera.resized(network.width, network.height, network.fidelity),
-        camera_height_m=recording.camera_height_m,
-    )
 
 
 def _write_images(folder: Path, recording: Recording, network: NetworkConfig) -> list[str]:
@@ -143,22 +148,12 @@ def _write_images(folder: Path, recording: Recording, network: NetworkConfig) ->
         except DataError as error:
             return str(error)
         jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-        _put(_file(folder, "images", recording.start + index), bytes(jpeg))
+        write_atomically(_file(folder, "images", recording.start + index), bytes(jpeg), sync=False)
         return ""
 
     one_by_one = recording.video is not None  # a video is decoded in order
     with ThreadPoolExecutor(1 if one_by_one else os.cpu_count()) as pool:
         return [problem for problem in pool.map(shrink, range(len(recording))) if problem]
-
-
-def _write_truth(folder: Path, snippet: Recording, middle: int) -> None:
-    """Write what is known of a snippet to validate on: depth of its middle frame, as it is stored, and poses."""
-    depth = snippet.depth[middle] if snippet.depth else None
-    if depth is not None:
-        _put(_file(folder, "depth", snippet.start + middle), depth.read_bytes())
-    T_world_camera = snippet.true_poses()
-    if T_world_camera is not None:
-        np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
 
 
 def _write_labels(measured: DriveLabels, folder: Path, network: NetworkConfig) -> None:
@@ -169,9 +164,4 @@ def _write_labels(measured: DriveLabels, folder: Path, network: NetworkConfig) -
         shutil.copyfile(measured.weights_file, kept.weights_file)
     for target in measured.targets(network.sources):
         if measured.label_file(target).is_file():
-            _put(kept.label_file(target), encode(*measured.label(target)))
-
-
-def _put(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+            write_atomically(kept.label_file(target), encode(*measured.label(target)), sync=False)

@@ -20,7 +20,7 @@ from erfsfm.common.readers.images import Image, read_depth_map, read_image, resi
 from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import Fidelity
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 logger = logging.getLogger(__name__)
 
@@ -50,16 +50,14 @@ class Video:
         """One frame ``(height, width, 3)`` uint8 RGB, resized without crop."""
         frames = _kept.get(self.path)
         if frames is None or frames.shape[1:3] != (height, width):
-            frames = _kept[self.path] = self._keep(height, width)
+            decoded = VideoFrames(self.path, counted_frames=0)
+            with tempfile.TemporaryFile(prefix="erfsfm-video-") as file:
+                for number in range(self._length):
+                    file.write(resize_image(decoded.read(number), height, width).tobytes())
+                file.flush()
+                frames = np.memmap(file, np.uint8, "r", shape=(self._length, height, width, 3))
+            _kept[self.path] = frames
         return np.array(frames[index])
-
-    def _keep(self, height: int, width: int) -> Image:
-        frames = VideoFrames(self.path, counted_frames=0)
-        with tempfile.TemporaryFile(prefix="erfsfm-video-") as file:
-            for index in range(self._length):
-                file.write(resize_image(frames.read(index), height, width).tobytes())
-            file.flush()
-            return np.memmap(file, np.uint8, "r", shape=(self._length, height, width, 3))
 
 
 @dataclass(frozen=True)

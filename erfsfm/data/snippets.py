@@ -1,4 +1,4 @@
-"""Windows of consecutive frames with the target in the middle, as training samples.
+"""Windows of consecutive frames with the target in the middle, as training samples; labels of simulated worlds.
 
 Sample number i is a pure function of the seed and i: which recording, which window, which
 augmentation. A run resumed at step k therefore draws the same samples as an uninterrupted one.
@@ -7,6 +7,7 @@ augmentation. A run resumed at step k therefore draws the same samples as an uni
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,15 +16,23 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import DataConfig, ExperimentConfig
-from erfsfm.data.array_cache import ImageCache
-from erfsfm.data.exact_depth import ExactLabels, by_label, depth_mb
+from erfsfm.data.augmentation import as_tensors, depth_alone, single_image, training_sample
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from erfsfm.data.samples import as_tensors, depth_alone, single_image, training_sample
 from erfsfm.data.split import usable
-from erfsfm.data.window import Snippet, TeacherStructure, first_readable, load_window, readable, snippet_motion
-from erfsfm.geometry.camera import Camera
+from erfsfm.data.window import (
+    ArrayCache,
+    Snippet,
+    TeacherStructure,
+    first_readable,
+    load_window,
+    snippet_motion,
+)
+from erfsfm.geometry import Camera
+
+_VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
@@ -43,16 +52,25 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._rank = rank
-        labels = depth_mb(config) + (0 if many_views is None else labels_mb(config.data))
-        self._cache = ImageCache(config.data.cache_mb - labels, config.network.height, config.network.width)
+        size = (config.network.height, config.network.width)
+        depth_mb = config.data.cache_mb // 5 if config.data.exact > 0 or config.teacher.exact else 0
+        images_mb = config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
+        self._cache = ArrayCache(images_mb, (*size, 3), np.uint8)
         self._unreadable: set[str] = set()
-        self._exact_labels = ExactLabels((config.network.height, config.network.width), depth_mb(config))
+        self._exact_labels = ExactLabels(size, depth_mb)
         self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
         self._exact, self._measured = by_label(self.recordings, config)
         weights = config.data.weights
-        _require_known(self.recordings, weights)
+        for prefix in weights:
+            if not any(recording.name.startswith(prefix) for recording in self.recordings):
+                raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
+        for recording in self.recordings:
+            if weights and not recording.name.startswith(tuple(weights)):
+                raise DataError(
+                    f"data.weights gives '{recording.name}' no weight: name it there, or leave its data set out"
+                )
         windows = [len(recording) - length + 1 for recording in self._measured]
         self._probabilities = chances(self._measured, windows, weights)
         # a long world is as good as a short one
@@ -78,7 +96,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             recording = self._exact[int(rng.choice(len(self._exact), p=self._exact_probabilities))]
             index = int(rng.integers(len(recording)))
             bounds, camera = self._exact_labels.bounds(recording, index), self._camera(recording)
-            return single_image(self._cache.image(recording, index), camera, bounds, self._config, rng)
+            (image,) = load_window(self._cache, Snippet(recording, index), 1)
+            return single_image(image, camera, bounds, self._config, rng)
         snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
         camera = self._camera(snippet.recording)
         seen = self._structure(snippet, images, camera)
@@ -101,18 +120,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
 
     def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
         """Random snippets without end."""
+        sources = self._config.network.sources
         while True:
             recording = self._measured[int(rng.choice(len(self._measured), p=self._probabilities))]
-            starts = self._starts(recording)
+            starts = range(len(recording) - sources)  # first frames of the snippets that may be drawn
+            if self._many_views is not None:
+                targets = self._many_views.drive(recording).targets(sources)
+                starts = range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
             yield Snippet(recording, starts[int(rng.integers(len(starts)))])
-
-    def _starts(self, recording: Recording) -> range:
-        """First frames of the snippets that may be drawn."""
-        sources = self._config.network.sources
-        if self._many_views is None:
-            return range(len(recording) - sources)
-        targets = self._many_views.drive(recording).targets(sources)
-        return range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
 
     def _structure(self, snippet: Snippet, images: list[NDArray[np.uint8]], camera: Camera) -> TeacherStructure | None:
         """The label of a snippet, if there is a teacher."""
@@ -134,12 +149,19 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 
     def __init__(self, recordings: Sequence[Recording], config: ExperimentConfig) -> None:
         self._network = config.network
-        self._cache = ImageCache(config.data.cache_mb, self._network.height, self._network.width)
+        self._cache = ArrayCache(config.data.cache_mb, (self._network.height, self._network.width, 3), np.uint8)
         length = config.network.sources + 1
         kept = usable(recordings, length)
         windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
-        chosen = np.linspace(0, len(windows) - 1, min(config.data.validation_snippets, len(windows)))
-        self.snippets = readable([windows[int(i)] for i in chosen.round()], self._read)
+        chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
+        self.snippets, reasons = [], []
+        for snippet in (windows[int(i)] for i in chosen.round()):
+            try:
+                self._read(snippet)
+                self.snippets.append(snippet)
+            except DataError as error:
+                reasons.append(str(error))
+        report_unreadable(reasons, len(chosen), "snippets to validate on")
 
     def __len__(self) -> int:
         return len(self.snippets)
@@ -169,18 +191,6 @@ def labels_mb(config: DataConfig) -> int:
     return config.cache_mb * 2 // 5
 
 
-def _require_known(recordings: Sequence[Recording], weights: Mapping[str, float]) -> None:
-    """Refuse weights of nothing, and recordings without one."""
-    for prefix in weights:
-        if not any(recording.name.startswith(prefix) for recording in recordings):
-            raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
-    for recording in recordings:
-        if weights and not recording.name.startswith(tuple(weights)):
-            raise DataError(
-                f"data.weights gives '{recording.name}' no weight: name it there, or leave its data set out"
-            )
-
-
 def chances(recordings: Sequence[Recording], sizes: Sequence[int], weights: Mapping[str, float]) -> NDArray[np.float64]:
     """Chance of each recording: by its size among those of its prefix, and by the weight of the prefix."""
     each = np.array(sizes, dtype=np.float64)
@@ -190,3 +200,61 @@ def chances(recordings: Sequence[Recording], sizes: Sequence[int], weights: Mapp
         if chosen.any():
             total += np.where(chosen, weight * each / each[chosen].sum(), 0)
     return np.asarray(total / total.sum()) if len(recordings) else total
+
+
+FARTHEST_M = 200.0  # what the simulator leaves unknown is sky; of a depth camera it may be anywhere
+
+
+class ExactLabels:
+    """Labels of recordings with exact depth, in camera heights; ``size``: height and width of the images."""
+
+    def __init__(self, size: tuple[int, int], cache_mb: int) -> None:
+        self._size = size
+        self._depth = ArrayCache(cache_mb, size, np.float32)
+        self._poses: dict[tuple[str, Path], NDArray[np.float64] | None] = {}
+
+    def bounds(self, recording: Recording, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Least and most inverse depth of a frame, each ``(H, W)``."""
+        height_m = recording.camera_height_m
+        assert height_m is not None, "recordings are exact"
+        depth_m = self._depth.get((*recording.key, index), lambda: recording.shrunk_depth(index, *self._size))
+        seen = depth_m > 0
+        beyond = height_m / FARTHEST_M if recording.name.startswith("simulated/") else np.inf
+        most = np.where(seen, height_m / np.where(seen, depth_m, 1), beyond).astype(np.float32)
+        return np.where(seen, most, 0).astype(np.float32), most
+
+    def structure(self, recording: Recording, first: int, sources: int) -> TeacherStructure:
+        """Of the snippet that begins at a frame; its motion is unknown where the recording has no poses."""
+        if recording.key not in self._poses:
+            self._poses[recording.key] = recording.true_poses()
+        T_world_camera = self._poses[recording.key]
+        T_source_target = np.full((sources, 4, 4), np.nan, np.float32)
+        if T_world_camera is not None and recording.camera_height_m is not None:
+            T_source_target = snippet_motion(T_world_camera, first, sources).astype(np.float32)
+            T_source_target[:, :3, 3] /= recording.camera_height_m
+        return TeacherStructure(T_source_target, *self.bounds(recording, first + sources // 2))
+
+
+def by_label(recordings: Sequence[Recording], config: ExperimentConfig) -> tuple[list[Recording], list[Recording]]:
+    """The recordings of which single images with exact depth are drawn, and those of which snippets are."""
+    exact = [recording for recording in recordings if recording.exact]
+    measured = [recording for recording in recordings if not recording.exact]
+    if config.teacher.exact and measured:
+        raise DataError(
+            f"teacher.views=exact needs the true depth of every recording; {measured[0].name} has none: simulate with "
+            "--depth, or label real drives by teacher.views=many"
+        )
+    if config.data.exact == 0:
+        return [], list(recordings)
+    if not exact or not measured:
+        raise DataError(
+            "data.exact mixes simulated worlds that have depth maps (erfsfm-slam simulate --depth) with other "
+            f"recordings; found {len(exact)} and {len(measured)}"
+        )
+    return exact, measured
+
+
+def stacked(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """A batch: of every tensor those of the samples that have it, in order."""
+    keys = dict.fromkeys(key for sample in samples for key in sample)
+    return {key: torch.stack([sample[key] for sample in samples if key in sample]) for key in keys}

@@ -4,6 +4,10 @@ Names are those of `erfsfm.common.readers.frame_range`.
 
 The shipped ones lie in ``configs/splits``. Single frames are written as runs: ``[0:64:3, 69, 72]`` are the frames
 0, 3, ..., 63, 69 and 72.
+
+Frames in which the car stands still are left out: there only traffic moves, which gives a wrong depth. They are told by
+the speed of the GPS/IMU, or by image differences where there is none. A packet or an image that cannot be read is taken
+for one of a moving car.
 """
 
 from __future__ import annotations
@@ -11,17 +15,21 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from erfsfm.common.config_tree import Section, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
-from erfsfm.config import DataConfig, config_folders
+from erfsfm.common.readers.kitti import velocity
+from erfsfm.config import EIGEN, DataConfig, config_folders
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.data.standstill import moving_parts
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +55,17 @@ class Split(Section):
 
     def test_frames(self) -> list[tuple[str, int]]:
         """Every single frame to test on: its recording and number."""
-        return [frame for name in self.test for frame in _frames(name)]
+        frames: list[tuple[str, int]] = []
+        for name in self.test:
+            match = _FRAMES.fullmatch(name.strip())
+            runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
+            if match is None or None in runs:
+                raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
+            for run in filter(None, runs):
+                first = int(run["first"])
+                numbers = range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
+                frames += [(match["recording"], number) for number in numbers]
+        return frames
 
 
 def read_split_file(name_or_path: str) -> Split:
@@ -63,18 +81,6 @@ def read_split_file(name_or_path: str) -> Split:
     return read_model(Split, path, DataError, "is no split of train, validation and test")
 
 
-def _frames(name: str) -> list[tuple[str, int]]:
-    match = _FRAMES.fullmatch(name.strip())
-    runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
-    if match is None or None in runs:
-        raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
-    numbers: list[int] = []
-    for run in filter(None, runs):
-        first = int(run["first"])
-        numbers += range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
-    return [(match["recording"], number) for number in numbers]
-
-
 def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
     """Recordings that hold at least one snippet; ``DataError`` where none does."""
     kept = [r for r in recordings if len(r) >= length]
@@ -88,33 +94,35 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     split = read_split_file(config.split) if config.split else Split()
-    left_out = read_split_file(config.leave_out).test_recordings if config.leave_out != "none" else []
-    scenes = [FrameRange.parse(name) for name in left_out]
+    scenes = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
     ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
     listed = [FrameRange.parse(name) for name in split.train]
     held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
-    never = [FrameRange.parse(name) for name in (*config.exclude, *split.test_recordings)]
+    excluded = [name for name in config.exclude if name != EIGEN]
+    never = [FrameRange.parse(name) for name in (*excluded, *split.test_recordings)]
     unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
     if unknown:
         raise DataError(f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}")
     found = [recording for root in config.roots for recording in discover(root)]
+    names = _some([recording.name for recording in found])
     for key, span in zip(config.ranges, ranges):
         if not any(_spans(recording, [span]) for recording in found):
-            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {_names(found)}")
+            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {names}")
     _require_begun(found, [*ranges, *listed, *held_out])
     training: list[Recording] = []
     validation: list[Recording] = []
     for recording in found:
         validation += _parts(recording, held_out)
-        forbidden = [*held_out, *never, *(scenes if recording.name.startswith("kitti_raw/") else [])]
+        eigens = map(FrameRange.parse, scenes if recording.name.startswith("kitti_raw/") else ())
+        forbidden = [*held_out, *never, *eigens]
         chosen = next((each for each in (ranges, listed) if _spans(recording, each)), None)  # ranges before a list
         whole = [] if listed else [recording]
         for part in whole if chosen is None else _parts(recording, chosen):
             training += _rest(part, forbidden)
     if not training:
         raise DataError(
-            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used to validate or "
-            "test; see data.exclude, data.validation, data.split and data.leave_out"
+            f"nothing left to train on: every recording found ({names}) is excluded or used to validate or "
+            "test; see data.exclude, data.validation and data.split"
         )
     if config.validation_share > 0:
         training, ends = _ends_split_off(training, config.validation_share)
@@ -122,14 +130,14 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
         wanted = _some([*config.validation, *split.validation])
         raise DataError(
-            f"nothing to validate on: data.validation and data.split name {wanted}; found {_names(found)}; name one of "
+            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of "
             "these, or train without validation by data.validation=[]"
         )
     named = config.validation if config.validation != _DEFAULT_VALIDATION else []
     absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
     if absent:
         logger.warning("data.validation names %s, which is not among the data", _some(absent))
-    return _without_stops(training, config), _without_stops(validation, config)
+    return _without_stops(training), _without_stops(validation)
 
 
 def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
@@ -150,10 +158,6 @@ def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Rec
 
 def _lengths(recordings: Sequence[Recording]) -> str:
     return _some([f"{recording.name} ({len(recording)} frames)" for recording in recordings])
-
-
-def _names(recordings: Sequence[Recording]) -> str:
-    return _some([recording.name for recording in recordings])
 
 
 def _some(names: Sequence[str]) -> str:
@@ -191,24 +195,82 @@ def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> 
             raise DataError(f"{frames} begins after the {end} frames that the recording has")
 
 
-def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
+def _without_stops(recordings: list[Recording]) -> list[Recording]:
     """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
-    if config.static_frames == "keep":
-        return recordings
-    kept = [part for recording in recordings for part in _moving(recording)]
+    kept: list[Recording] = []
+    for recording in recordings:
+        kind, _, _ = recording.name.partition("/")
+        if recording.without_stops or kind not in ("kitti_raw", "folder") or recording.exact:
+            kept.append(recording)
+        elif kind == "kitti_raw":
+            kept += moving_parts(recording)
+        else:  # a doubled frame of an own video is no stop, and its drive stays whole for the teacher
+            shortest = min(_SHORTEST_END, len(recording))
+            kept += [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= shortest]
     before = sum(map(len, recordings))
     if (lost := before - sum(map(len, kept))) > 0:
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)
     if recordings and not kept:
-        raise DataError("the camera stands still in every frame found: data.static_frames=keep trains on them")
+        raise DataError("the camera stands still in every frame found: nothing can be learned from them")
     return kept
 
 
-def _moving(recording: Recording) -> list[Recording]:
-    """A doubled frame of an own video is no stop, and its drive stays whole for the teacher."""
-    kind, _, _ = recording.name.partition("/")
-    if recording.without_stops or kind not in ("kitti_raw", "folder") or recording.exact:
-        return [recording]
-    if kind == "kitti_raw":
-        return moving_parts(recording)
-    return [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= min(_SHORTEST_END, len(recording))]
+STILL_M_S = 0.5  # 5 cm a frame
+STILL_LEVELS = 1.5  # of 255; five real drives at 2.4 m/s and more never changed by less than 2
+_SMALL = (104, 32)  # columns, rows: coarse enough to average noise away
+
+
+def moving_parts(recording: Recording, shortest_stop: int = 1) -> list[Recording]:
+    """The stretches of a recording between stops of that many frames, in order; all of it where it never stops."""
+    if recording.oxts is None:
+        still = _unchanged(recording)
+    else:
+        still = _speeds(recording.oxts, recording.start, len(recording)) < STILL_M_S
+    moving = np.ones(len(recording), np.bool_)
+    for start, stop in _runs(still):
+        moving[start:stop] = stop - start < shortest_stop
+    return [recording.part(int(start), int(stop)) for start, stop in _runs(moving)]
+
+
+def _runs(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Starts and ends ``(K, 2)`` of the runs of chosen frames."""
+    return np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+
+
+@lru_cache(maxsize=1)
+def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
+    """``(N,)`` in m/s, NaN where unknown; the cameras of a drive share them."""
+    speeds = np.full(frames, np.nan)
+    reasons = []
+    for index in range(frames):
+        try:
+            speeds[index] = np.linalg.norm(velocity(oxts, start + index))
+        except DataError as error:
+            reasons.append(str(error))
+    if len(reasons) == frames:
+        raise DataError(reasons[0])
+    if reasons:
+        logger.warning("%d of %d frames have no speed and are kept: %s", len(reasons), frames, reasons[0])
+    return speeds
+
+
+def _unchanged(recording: Recording) -> NDArray[np.bool_]:
+    """Whether an image hardly differs from the last before it, by its median absolute change of grey level, ``(N,)``.
+
+    The median is robust to traffic. The median change itself is subtracted first, as a change of exposure. The first
+    frame has the result of the second.
+    """
+    columns, rows = _SMALL
+    changes = np.full(len(recording), np.nan)
+    previous: NDArray[np.float32] | None = None
+    for index in range(len(recording)):
+        try:
+            image = cv2.cvtColor(recording.image(index, rows, columns), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        except DataError:
+            continue  # whoever reads the snippets names it
+        if previous is not None:
+            change = image - previous
+            changes[index] = np.median(np.abs(change - np.median(change)))
+        previous = image
+    changes[0] = changes[min(1, len(changes) - 1)]
+    return changes < STILL_LEVELS

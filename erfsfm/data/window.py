@@ -1,4 +1,4 @@
-"""Windows of consecutive frames, and what is known of them.
+"""Windows of consecutive frames, what is known of them, and the cache that their images are read through.
 
 A file that cannot be read costs the windows that hold it, not a night of training.
 """
@@ -6,17 +6,18 @@ A file that cannot be read costs the windows that hold it, not a night of traini
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
-from typing import TypeVar
+from math import prod
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import report_unreadable
-from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.recordings import Recording
 
 logger = logging.getLogger(__name__)
@@ -58,9 +59,13 @@ def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int
     return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target])
 
 
-def load_window(cache: ImageCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
-    """The images of a snippet at the networks' size, in time order."""
-    return [cache.image(snippet.recording, snippet.first + k) for k in range(length)]
+def load_window(cache: ArrayCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
+    """The images ``(H, W, 3)`` of a snippet in time order, of the size that the cache has them in."""
+    recording, (height, width, _) = snippet.recording, cache.shape
+    return [
+        cache.get((*recording.key, index), partial(recording.image, index, height, width))
+        for index in range(snippet.first, snippet.first + length)
+    ]
 
 
 def first_readable(snippets: Iterator[Snippet], read: Callable[[Snippet], T], named: set[str]) -> tuple[Snippet, T]:
@@ -80,14 +85,44 @@ def first_readable(snippets: Iterator[Snippet], read: Callable[[Snippet], T], na
     raise DataError(f"{_MOST_IN_A_ROW} snippets in a row cannot be read, the last: {reason}")
 
 
-def readable(snippets: list[Snippet], read: Callable[[Snippet], object]) -> list[Snippet]:
-    """The snippets that can be read; of the others one warning, and ``DataError`` where none can."""
-    kept, reasons = [], []
-    for snippet in snippets:
-        try:
-            read(snippet)
-            kept.append(snippet)
-        except DataError as error:
-            reasons.append(str(error))
-    report_unreadable(reasons, len(snippets), "snippets to validate on")
-    return kept
+_BLOCK = 128  # arrays
+
+
+class ArrayCache:
+    """Least-recently-used cache of arrays, up to a size in bytes.
+
+    They are stored in large blocks. Stored one by one among the short-lived arrays of a sample they fragment the heap:
+    three times their size was measured.
+
+    Args:
+        limit_mb: memory for arrays; 0 keeps none.
+        shape: of every array.
+        dtype: of every array.
+    """
+
+    def __init__(self, limit_mb: int, shape: tuple[int, ...], dtype: DTypeLike) -> None:
+        self.shape = shape
+        self._dtype = np.dtype(dtype)
+        self._capacity = limit_mb * 2**20 // (prod(shape) * self._dtype.itemsize)
+        self._blocks: list[NDArray[Any]] = []
+        self._slots: OrderedDict[Hashable, int] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        """The array of a key, made at most once while it stays in the cache; the caller may change it."""
+        slot = self._slots.get(key)
+        if slot is not None:
+            self._slots.move_to_end(key)
+            return self._place(slot).copy()
+        array = make()
+        if self._capacity > 0:
+            slot = len(self._slots) if len(self._slots) < self._capacity else self._slots.popitem(last=False)[1]
+            self._place(slot)[:] = array
+            self._slots[key] = slot
+        return array
+
+    def _place(self, slot: int) -> NDArray[Any]:
+        block, row = divmod(slot, _BLOCK)
+        if block == len(self._blocks):
+            arrays = min(_BLOCK, self._capacity - slot)
+            self._blocks.append(np.empty((arrays, *self.shape), self._dtype))
+        return np.asarray(self._blocks[block][row])

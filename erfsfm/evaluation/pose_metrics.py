@@ -62,7 +62,11 @@ def snippet_errors(
     count, length = predicted.shape[:2]
     if count == 0 or length < 2:
         raise ValueError(f"need at least one snippet of two frames; got {count} of {length}")
-    ate = _position_errors(predicted[..., :3, 3], truth[..., :3, 3])
+    p, g = predicted[..., :3, 3], truth[..., :3, 3]
+    energy, true_energy = (p**2).sum(axis=(1, 2)), (g**2).sum(axis=(1, 2))
+    scale = np.zeros(count)
+    np.divide((g * p).sum(axis=(1, 2)), energy, out=scale, where=energy > _STILL_RATIO**2 * true_energy)
+    ate = np.sqrt(((g - scale[:, None, None] * p) ** 2).sum(axis=(1, 2))) / length
     R_error = truth[..., :3, :3] @ np.swapaxes(predicted[..., :3, :3], -1, -2)
     re = rotation_angle(R_error).sum(axis=1) / length
     if fidelity == "paper":
@@ -111,17 +115,6 @@ def rotation_angle(R: FloatArray) -> FloatArray:
     sine = np.linalg.norm(np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1), axis=-1)
     angle: FloatArray = np.arctan2(sine, np.trace(R, axis1=-2, axis2=-1) - 1.0)
     return angle
-
-
-def _position_errors(predicted: FloatArray, truth: FloatArray) -> FloatArray:
-    """ATE ``(S,)`` of positions ``(S, K, 3)``."""
-    energy = (predicted**2).sum(axis=(1, 2))
-    agreement = (truth * predicted).sum(axis=(1, 2))
-    moves = energy > _STILL_RATIO**2 * (truth**2).sum(axis=(1, 2))
-    scale = np.divide(agreement, energy, out=np.zeros_like(energy), where=moves)
-    residual = truth - scale[:, None, None] * predicted
-    ate: FloatArray = np.sqrt((residual**2).sum(axis=(1, 2))) / predicted.shape[1]
-    return ate
 
 
 def _invert(T_a_b: FloatArray) -> FloatArray:

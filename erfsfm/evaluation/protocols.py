@@ -1,10 +1,16 @@
-"""Evaluation protocols: trained networks on recordings with ground truth, beside a baseline that uses no image."""
+"""Evaluation protocols: trained networks on recordings with ground truth, beside a baseline that uses no image.
+
+True depth is that of streets: simulated worlds, KITTI raw drives with LiDAR, and folders of images beside depth maps.
+On other drives static surfaces are measured from neighbouring frames at a run's poses.
+"""
 
 from __future__ import annotations
 
+import tempfile
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +22,24 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
+from erfsfm.common.readers.images import list_images, read_depth_map, read_image
+from erfsfm.common.readers.kitti import find_drives
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
+from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from erfsfm.evaluation.depth_metrics import CAP_M, DepthErrors, depth_errors, mean_errors, mean_ratio, standard_error
+from erfsfm.evaluation.depth_metrics import (
+    CAP_M,
+    Crop,
+    DepthErrors,
+    depth_errors,
+    mean_errors,
+    mean_ratio,
+    standard_error,
+)
+from erfsfm.evaluation.eigen import RawFrame, lidar_depth
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
-from erfsfm.evaluation.streets import Street, find_streets
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import DepthPosePredictor, refuse_leak
 
 _BASELINE = "median depth map"
 _PICTURE_WIDTH = 620
@@ -159,7 +176,12 @@ def pose_protocol(
 
 
 def named_recordings(root: Path, name: str) -> list[Recording]:
-    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera."""
+    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera.
+
+    Without a name they are all recordings of the root.
+    """
+    if not name:
+        return discover(root)
     found: dict[str, list[Recording]] = {}
     for each in discover(root):
         for known in {each.name, each.sequence or each.name}:
@@ -198,10 +220,184 @@ def _depth_row(method: str, streets: list[list[DepthErrors]], before: list[list[
     return row | {"images": len(scales), "streets": len(streets)}
 
 
-def refuse_leak(networks: DepthPosePredictor, names: Sequence[str], allow_leak: bool) -> bool:
-    """Whether some of the frames were trained on; ``DataError`` where that was not allowed."""
-    leaked = networks.leaks(names)
-    if leaked and not allow_leak:
-        some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")
-        raise DataError(f"leak: these weights were trained on {some}; choose other weights or data, or --allow-leak")
-    return bool(leaked)
+CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
+LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
+SLAM_WEIGHTS = "default"
+TRUTH_FOLDER = "truth"
+_RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: the scale is fitted
+
+
+def many_view_protocol(
+    networks: DepthPosePredictor,
+    recordings: Sequence[Recording],
+    cache: Path | None,
+    allow_leak: bool,
+    progress: Progress,
+) -> list[dict[str, Any]]:
+    """Median-scaled depth errors where the many-view teacher knows the depth within ``LARGEST_RATIO``.
+
+    What moves, shines or is seen by one neighbour alone is left out, so the errors are smaller than against LiDAR:
+    compare rows of this protocol with each other.
+
+    Args:
+        networks: to evaluate.
+        recordings: whole drives, or parts of them.
+        cache: receives poses and depth, for the next call; forgotten where None.
+        allow_leak: evaluate also frames that the networks were trained on.
+        progress: told of the stage, what is done, and of how many.
+
+    Returns:
+        One row for each recording; ``known`` is the share of pixels that were compared.
+
+    Raises:
+        DataError: a leak that was not allowed, or no depth could be measured.
+        TrainingError: a recording gives no trajectory or no scale.
+    """
+    leaks = [refuse_leak(networks, [each.frames_name], allow_leak) for each in recordings]
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as temporary:
+        for recording, leak in zip(recordings, leaks):
+            ratio = min(1.0, LARGEST_WIDTH / recording.camera.width)
+            size = (round(recording.camera.height * ratio), round(recording.camera.width * ratio))
+            # the teacher's labels are measured around a network's depth, and truth without any
+            teacher = ManyViewTeacher((cache or Path(temporary)) / TRUTH_FOLDER, size, EVERY)
+            teacher.prepare([recording], networks.sources, SLAM_WEIGHTS, progress)
+            drive, errors, known = teacher.drive(recording), [], []
+            for target in drive.targets(networks.sources):
+                low, high = (bound.astype(np.float32) for bound in drive.label(target))
+                narrow = (low > 0) & (high < LARGEST_RATIO * low)
+                truth = np.zeros_like(low)  # where the bounds are too far apart
+                truth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
+                error = depth_errors(networks.depth(recording.image(target, *truth.shape)), truth, CAP_HEIGHTS)
+                if error is not None:
+                    errors.append(error)
+                    known.append(float(np.mean((truth > 0) & (truth < CAP_HEIGHTS))))
+            if not errors:
+                raise DataError(f"no depth could be measured in {recording.frames_name}: the camera has to travel")
+            mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
+            row: dict[str, Any] = {"method": "networks", "recording": recording.frames_name}
+            row |= {key: getattr(mean, key) for key in _RATIOS}
+            row |= {"scale_spread": float(scales.std() / scales.mean()), "known": float(np.mean(known))}
+            rows.append(row | {"images": len(errors), "leak": leak})
+    return rows
+
+
+EVERY = 5  # frames of a recording or drive, of which one is compared
+IMAGES, TRUTH = "images", "truth"
+
+Image = NDArray[np.uint8]
+Depth = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Street:
+    """Frames of one drive in order.
+
+    Attributes:
+        name: of the drive, as the leak record writes it.
+        seen: names with frames, for the leak record.
+        frames: each gives an image ``(H, W, 3)`` and its true z-depth in metres ``(H, W)``, 0 where unknown.
+        crop: part of the image that is compared.
+        typical: a depth map that uses no image ``(H, W)``; None for LiDAR, whose points are few.
+    """
+
+    name: str
+    seen: list[str]
+    frames: list[Callable[[], tuple[Image, Depth]]]
+    crop: Crop
+    typical: Depth | None = None
+
+
+def find_streets(root: Path) -> list[Street]:
+    """Every street under a root: all pairs of a folder, every fifth frame of a recording or a drive.
+
+    Raises:
+        DataError: there is none, or depth maps of different sizes.
+    """
+    if not root.exists():
+        raise DataError(f"no data set at {root}: the path does not exist")
+    streets = _of_pairs(root) or _of_drives(root) or _of_recordings(root)
+    if not streets:
+        raise DataError(
+            f"no true depth in {root}: wanted sequences/NN/depth_2 (erfsfm-slam simulate --depth), KITTI raw drives "
+            f"with velodyne_points, or {IMAGES}/ and {TRUTH}/ with 16-bit depth maps (metres x 256) of the same names"
+        )
+    return streets
+
+
+def _of_pairs(root: Path) -> list[Street]:
+    """Images and depth maps of the same names; a street is what their names have before the last underscore."""
+    if not ((root / IMAGES).is_dir() and (root / TRUTH).is_dir()):
+        return []
+    streets: dict[str, Street] = {}
+    for image in list_images(root / IMAGES):
+        truth = root / TRUTH / f"{image.stem}.png"
+        if truth.is_file():
+            before = image.stem.rpartition("_")[0]
+            name = f"folder/{root.resolve().name}" + (f"/{before}" if before else "")
+            street = streets.setdefault(name, Street(name, [name], [], "garg"))
+            street.frames.append(partial(_pair, image, truth))
+    return [*streets.values()]
+
+
+def _pair(image_file: Path, truth_file: Path) -> tuple[Image, Depth]:
+    image, truth = read_image(image_file), read_depth_map(truth_file).astype(np.float32)
+    if image.shape[:2] != truth.shape:
+        raise DataError(f"{truth_file} has size {truth.shape[::-1]}, and its image {image.shape[1::-1]}: give one size")
+    return image, truth
+
+
+def _of_drives(root: Path) -> list[Street]:
+    """KITTI raw drives by their scans, in the crop of Garg et al."""
+    streets = []
+    for drive, folder in find_drives(root).items():
+        scans = sorted(int(path.stem) for path in (folder / "velodyne_points" / "data").glob("*.bin"))
+        base = folder.absolute().parents[1]
+        frames = [RawFrame(base, drive, index) for index in scans[::EVERY]]
+        if frames:
+            seen = [frame.name for frame in frames]
+            streets.append(Street(f"kitti_raw/{drive}", seen, [partial(_scan, frame) for frame in frames], "garg"))
+    return streets
+
+
+def _scan(frame: RawFrame) -> tuple[Image, Depth]:
+    image = read_image(frame.image_path())
+    return image, lidar_depth(frame, image.shape[:2])
+
+
+def _of_recordings(root: Path) -> list[Street]:
+    """Recordings with depth maps; the parts of one between gaps are one street."""
+    recordings = [recording for recording in discover(root) if any(recording.depth or ())]
+    indices = [np.flatnonzero([file is not None for file in r.depth or ()])[::EVERY] for r in recordings]
+    frames = [(recording, int(index)) for recording, those in zip(recordings, indices) for index in those]
+    truths = [_truth(recording, index) for recording, index in frames]
+    if len({truth.shape for truth in truths}) > 1:
+        raise DataError(f"depth maps of different sizes in {root}: evaluate recordings of one size at a time")
+    streets: dict[str, Street] = {}
+    typical = _median_map(truths) if truths else None
+    for recording in recordings:
+        street = streets.setdefault(recording.name, Street(recording.name, [], [], "none", typical))
+        street.seen.append(recording.frames_name)
+    for recording, index in frames:
+        streets[recording.name].frames.append(partial(_frame, recording, index))
+    return [*streets.values()]
+
+
+def _truth(recording: Recording, index: int) -> Depth:
+    truth = recording.true_depth(index)
+    assert truth is not None, "frames with a depth map"
+    return truth
+
+
+def _frame(recording: Recording, index: int) -> tuple[Image, Depth]:
+    truth = _truth(recording, index)
+    return recording.image(index, *truth.shape), truth  # prepared images are smaller
+
+
+def _median_map(truths: list[Depth]) -> Depth:
+    """Per-pixel median of the true depth, the sky at the cap; every map has the first one's size."""
+    stacked = np.stack([np.where((t > 0) & (t < CAP_M), t, np.nan) for t in truths])
+    known = np.isfinite(stacked).any(axis=0)
+    median = np.full(stacked.shape[1:], CAP_M, dtype=np.float32)
+    median[known] = np.nanmedian(stacked[:, known], axis=0)
+    return median

@@ -13,9 +13,8 @@ from onnxruntime import InferenceSession
 
 from erfsfm.common.errors import CheckpointError
 from erfsfm.common.files import read_bytes
-from erfsfm.common.threads import open_session
-from erfsfm.mvs.refine import SIGMA_FLOOR, Measurement, RefinedDepth
-from erfsfm.mvs.sweep import CHANGES, UNIT, Costs, lowest
+from erfsfm.common.processes import open_session
+from erfsfm.mvs.refine import CHANGES, SIGMA_FLOOR, UNIT, Costs, Measurement, RefinedDepth, lowest
 from erfsfm.mvs.views import Array
 
 FILE = "fusion.onnx"
@@ -61,18 +60,13 @@ class DepthFusion:
         depth, channels = measurement.depth, evidence(measurement)
         h, w = channels.shape[1:]
         padded = np.pad(channels, ((0, 0), (0, -h % STEP), (0, -w % STEP)), mode="edge")
+        odd = (0, depth.shape[0] - 2 * h, 0, depth.shape[1] - 2 * w)  # where a size is odd its last row comes again
         change, log_sigma = (
-            _at_size(values[0, : 2 * h, : 2 * w], depth.shape)
+            cv2.copyMakeBorder(values[0, : 2 * h, : 2 * w], *odd, cv2.BORDER_REPLICATE)
             for values in self._session.run(["change", "log_sigma"], {"evidence": padded[None]})
         )
         sigma = np.hypot(np.minimum(np.exp(log_sigma), np.float32(_MOST_SIGMA)), np.float32(SIGMA_FLOOR))
         return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma, measurement.measured)
-
-
-def _at_size(values: Array, shape: tuple[int, ...]) -> Array:
-    """With the last row and column again where the size is odd."""
-    below, right = shape[0] - values.shape[0], shape[1] - values.shape[1]
-    return np.asarray(cv2.copyMakeBorder(values, 0, below, 0, right, cv2.BORDER_REPLICATE))
 
 
 def evidence(measurement: Measurement) -> Array:

@@ -6,9 +6,9 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from erfsfm.config import Fidelity as Fidelity
 from erfsfm.networks.deformable import DeformableConv2d
 
-Fidelity = Literal["default", "paper"]
 Normalisation = Literal["none", "batch"]
 Activation = Literal["relu", "leaky"]
 Variant = Literal["plain", "dilated", "dfc", "dfcv2"]

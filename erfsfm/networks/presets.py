@@ -63,7 +63,11 @@ def build(
     Raises:
         ConfigError: if the name or an option is unknown or out of range.
     """
-    preset = _find(name)
+    if name not in PRESETS:
+        close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
+        hint = f" (did you mean '{close[0]}'?)" if close else ""
+        raise ConfigError(f"unknown network '{name}'{hint}; known: {', '.join(PRESETS)}")
+    preset = PRESETS[name]
     if fidelity not in get_args(Fidelity):
         raise ConfigError(f"fidelity must be one of {', '.join(get_args(Fidelity))}; got '{fidelity}'")
     if not 0 < width <= 8:
@@ -105,11 +109,3 @@ def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 
             summary |= {"multiply_adds": None, "multiply_adds_reason": str(error)}
         summaries.append(summary | {"receptive_field": theoretical(network)})
     return summaries
-
-
-def _find(name: str) -> Preset:
-    if name in PRESETS:
-        return PRESETS[name]
-    close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
-    hint = f" (did you mean '{close[0]}'?)" if close else ""
-    raise ConfigError(f"unknown network '{name}'{hint}; known: {', '.join(PRESETS)}")

@@ -29,7 +29,6 @@ class MeasuredField:
 
     Attributes:
         pixel: (row, column) of the output pixel in the last encoder layer.
-        map_size: (height, width) of that layer.
         top: first image row with a gradient; so is `left` the first column.
         rows: height of the bounding box, 0 for an empty field.
         columns: width of it.
@@ -38,7 +37,6 @@ class MeasuredField:
     """
 
     pixel: tuple[int, int]
-    map_size: tuple[int, int]
     top: int
     left: int
     rows: int
@@ -135,7 +133,18 @@ def _evenly_weighted(network: Network, size: tuple[int, int], offsets_px: float)
             module.reset_parameters()
         elif isinstance(module, nn.ReLU6):
             module.max_val = math.inf  # a white image saturates it
-    predictors = _set_offsets(encoder, offsets_px)
+    predictors: set[nn.Module] = set()  # of offsets, which are fixed
+    for module in encoder.modules():
+        if not isinstance(module, DeformableConv2d):
+            continue
+        predictors |= {module.offset, module.modulator}
+        module.reset_offsets()
+        side = module.kernel.kernel_size[0]
+        outwards = torch.sign(torch.arange(side) - (side - 1) / 2) * offsets_px
+        taps = torch.stack(torch.meshgrid(outwards, outwards, indexing="ij"), dim=-1)  # (k, k, [dy, dx])
+        assert module.offset.bias is not None
+        with torch.no_grad():
+            module.offset.bias.copy_(taps.flatten())
     for module in encoder.modules():
         if isinstance(module, nn.Conv2d) and module not in predictors:
             nn.init.constant_(module.weight, 1 / module.weight[0].numel())
@@ -171,7 +180,7 @@ def field_of(
     top, rows = _extent(seen.any(dim=1))
     left, columns = _extent(seen.any(dim=0))
     coverage = float(seen.double().mean())
-    return MeasuredField((row, column), map_size, top, left, rows, columns, coverage, gradient)
+    return MeasuredField((row, column), top, left, rows, columns, coverage, gradient)
 
 
 def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
@@ -188,23 +197,6 @@ def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         shadow(*images)
     return int(counter.get_total_flops()) // 2
-
-
-def _set_offsets(encoder: Encoder, offsets_px: float) -> set[nn.Module]:
-    """Fix the offsets of all deformable layers; return the convolutions that predict them."""
-    predictors: set[nn.Module] = set()
-    for module in encoder.modules():
-        if not isinstance(module, DeformableConv2d):
-            continue
-        predictors |= {module.offset, module.modulator}
-        module.reset_offsets()
-        side = module.kernel.kernel_size[0]
-        outwards = torch.sign(torch.arange(side) - (side - 1) / 2) * offsets_px
-        taps = torch.stack(torch.meshgrid(outwards, outwards, indexing="ij"), dim=-1)  # (k, k, [dy, dx])
-        assert module.offset.bias is not None
-        with torch.no_grad():
-            module.offset.bias.copy_(taps.flatten())
-    return predictors
 
 
 def _extent(seen: Tensor) -> tuple[int, int]:

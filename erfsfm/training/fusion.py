@@ -23,8 +23,8 @@ from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.data.augmentation import weathered
 from erfsfm.data.discovery import discover
-from erfsfm.data.exact_depth import FARTHEST_M
 from erfsfm.data.recordings import Recording
+from erfsfm.data.snippets import FARTHEST_M
 from erfsfm.inference import DepthPosePredictor, depth_at, has_bfloat16
 from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP, evidence
 from erfsfm.mvs.refine import measure
@@ -330,7 +330,11 @@ class FusionSamples:
         K = camera.resized(WIDTH, height).K.astype(np.float64)
         channels = evidence(measure(target, guess, others, K, T_neighbour_target))
         is_known = truth > 0
-        return self._cropped(channels, np.log(guess / np.where(is_known, truth, FARTHEST_M)), is_known)
+        wanted, (h, w) = np.log(guess / np.where(is_known, truth, FARTHEST_M)), CROP
+        top, left = (int(rng.integers(have - need + 1)) for have, need in zip(channels.shape[1:], CROP))
+        at = slice(2 * top, 2 * (top + h)), slice(2 * left, 2 * (left + w))
+        part = channels[:, top : top + h, left : left + w]
+        return Sample(part.astype(np.float16), wanted[at].astype(np.float16), is_known[at])
 
     def _guess(self, image: NDArray[np.uint8], truth: Array) -> Array:
         """Learned depth with an error of its unit; often bent or blurred, as that of networks on unknown streets."""
@@ -345,13 +349,6 @@ class FusionSamples:
         if rng.random() < 0.4:
             depth = 1 / cv2.GaussianBlur(1 / depth, (0, 0), rng.uniform(1, 4))
         return np.asarray(depth, np.float32)
-
-    def _cropped(self, channels: Array, wanted: Array, is_known: NDArray[np.bool_]) -> Sample:
-        h, w = CROP
-        top, left = (int(self._rng.integers(have - need + 1)) for have, need in zip(channels.shape[1:], CROP))
-        at = slice(2 * top, 2 * (top + h)), slice(2 * left, 2 * (left + w))
-        part = channels[:, top : top + h, left : left + w]
-        return Sample(part.astype(np.float16), wanted[at].astype(np.float16), is_known[at])
 
 
 def _height(recording: Recording) -> int:

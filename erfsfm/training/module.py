@@ -14,15 +14,13 @@ from torch import Tensor, nn
 from erfsfm.checkpoint import build_networks
 from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig, NetworkKind, TrainedNetworks
-from erfsfm.data.samples import in_unit_range
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
-from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.losses.structure import Bounds
+from erfsfm.geometry import pose_vector_to_matrix
 from erfsfm.model_record import DepthInput
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0DepthNet
-from erfsfm.training.objective import Level, ObjectiveResult, SnippetBatch, evaluate_objective, to_network_range
+from erfsfm.training.objective import Level, SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -45,43 +43,30 @@ class SelfSupervision(lightning.LightningModule):
         self.depth_net, self.pose_net = build_networks(config.network).values()
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self.depth_input: DepthInput | None = None  # of the network that this training goes on with
-        self._choose_trained()
+        # networks, and the stages of pretrained encoders, that keep their weights
+        self.depth_net.requires_grad_(config.training.networks != "pose")
+        self.pose_net.requires_grad_(config.training.networks != "depth")
+        if isinstance(self.depth_net, Lite0DepthNet):
+            self.depth_net.encoder.stages[: config.training.frozen_stages].requires_grad_(False)  # the stem being one
+            # depthwise convolutions are a quarter faster so
+            self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.train()  # Lightning keeps the mode of each module
         self.loss = math.nan  # of the latest step
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
         self._constant_steps = 0
 
-    def _choose_trained(self) -> None:
-        """Exclude the network, and the stages of pretrained encoders, that keep their weights."""
-        training = self.config.training
-        self.depth_net.requires_grad_(training.networks != "pose")
-        self.pose_net.requires_grad_(training.networks != "depth")
-        if isinstance(self.depth_net, Lite0DepthNet):
-            self.depth_net.encoder.freeze(training.frozen_stages)
-            # depthwise convolutions are a quarter faster so
-            self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
     def network(self, kind: NetworkKind) -> nn.Module:
         """The network of that kind."""
         return self.depth_net if kind == "depth" else self.pose_net
 
-    def take_imagenet(self) -> None:
-        """Start the encoder of a lite0 network from ImageNet's weights.
-
-        Raises:
-            ConfigError: they are not installed.
-        """
-        if isinstance(self.depth_net, Lite0DepthNet):
-            self.depth_net.encoder.take_imagenet()
-
     def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
-        """Colour to [0, 1] where the networks are."""
-        return in_unit_range(batch)
+        """Colour to [0, 1] where the networks are; samples hold it as uint8, a quarter of the bytes to hand over."""
+        return {name: each.float() / 255 if each.dtype == torch.uint8 else each for name, each in batch.items()}
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The loss of one batch; `on_after_backward` stops the run where it is not finite or the depth a constant."""
-        bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
+        bounds = (batch["least"], batch["most"]) if "least" in batch else None
         none = batch["target"].new_zeros(0, self.config.network.sources, *batch["target"].shape[1:])
         sources = batch.get("sources", none)
         snippets = SnippetBatch(
@@ -89,7 +74,12 @@ class SelfSupervision(lightning.LightningModule):
         )
         result = evaluate_objective(self.depth_net, self.pose_net, snippets, self.config)
         self._terms = {name: value.detach() for name, value in result.terms.items()}
-        self._watched = torch.stack([result.total.detach(), _spread(result)])
+        # largest spread of the disparity in an image, standard deviation over mean; infinite without depth
+        spread = result.total.new_full((), torch.inf)
+        if result.disparities:
+            finest = result.disparities[0].detach()
+            spread = (finest.std(dim=(1, 2, 3)) / finest.mean(dim=(1, 2, 3))).amax()
+        self._watched = torch.stack([result.total.detach(), spread])
         self.log("loss", self._watched[0])
         self.log_dict({f"loss/{name}": value for name, value in self._terms.items()})
         return result.total
@@ -108,10 +98,6 @@ class SelfSupervision(lightning.LightningModule):
                 "training.gradient_clip, then continue with --resume, or start again where the last checkpoint is bad "
                 "already; the weights so far are in last/"
             )
-        self._refuse_constant(spread)
-
-    def _refuse_constant(self, spread: float) -> None:
-        """Stop once the disparity has been constant in all images for `_CONSTANT_STEPS` steps."""
         self._constant_steps = self._constant_steps + 1 if spread < _CONSTANT else 0
         if self._constant_steps == _CONSTANT_STEPS:
             raise TrainingError(
@@ -190,7 +176,11 @@ class SelfSupervision(lightning.LightningModule):
             self._note_poses(T_source_target, batch.get("T_source_target"))
         if disparity is not None and T_source_target is not None:
             with torch.autocast(self.device.type, enabled=False):
-                self._note("photometric", _reconstruction_error(batch, disparity, T_source_target))
+                # the smallest error among the sources (0.85 SSIM), whatever the training loss is
+                level = Level(batch["target"], batch["sources"], batch["K"], disparity)
+                errors, valid = level.errors(T_source_target, 0.85)
+                error = errors.masked_fill(~valid, torch.inf).amin(dim=1)
+                self._note("photometric", float(error[torch.isfinite(error)].mean()))
 
     def _note_depth(self, disparity: Tensor, true_depth: Tensor | None) -> None:
         self._note("disparity_spread", float(disparity.std() / disparity.mean()))
@@ -239,14 +229,6 @@ class SelfSupervision(lightning.LightningModule):
         self._validation.setdefault(name, []).append(value)
 
 
-def _spread(result: ObjectiveResult) -> Tensor:
-    """Largest spread of the disparity in an image, standard deviation over mean; infinite without depth."""
-    if not result.disparities:
-        return result.total.new_full((), torch.inf)
-    disparity = result.disparities[0].detach()
-    return (disparity.std(dim=(1, 2, 3)) / disparity.mean(dim=(1, 2, 3))).amax()
-
-
 def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> float:
     """The metric of a validation: error of depth, of poses where these alone are trained; less is better.
 
@@ -262,10 +244,3 @@ def learning_rate_factor(schedule: str, progress: float, step: int = _WARM_UP) -
         risen = min(max((step + 1) / _WARM_UP, 20 * progress), 1)
         return risen * (0.51 + 0.49 * math.cos(math.pi * progress))
     return 0.1 if schedule == "step" and progress >= 0.75 else 1.0
-
-
-def _reconstruction_error(batch: dict[str, Tensor], disparity: Tensor, T_source_target: Tensor) -> float:
-    """Mean over pixels of the smallest error among the sources (0.85 SSIM), whatever the training loss is."""
-    errors, valid = Level(batch["target"], batch["sources"], batch["K"], disparity).errors(T_source_target, 0.85)
-    error = errors.masked_fill(~valid, torch.inf).amin(dim=1)
-    return float(error[torch.isfinite(error)].mean())

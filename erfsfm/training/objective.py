@@ -12,14 +12,15 @@ from torch import Tensor, nn
 
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.data.window import HEIGHTS
-from erfsfm.geometry.camera import scale_intrinsics
-from erfsfm.geometry.transforms import pose_vector_to_matrix, project_into_source, sample
-from erfsfm.losses.photometric import edge_aware_smoothness, photometric_error, second_order_smoothness
-from erfsfm.losses.structure import (
+from erfsfm.geometry import pose_vector_to_matrix, project_into_source, sample, scale_intrinsics
+from erfsfm.losses import (
     Bounds,
     disagreement,
+    edge_aware_smoothness,
     enlarged,
+    photometric_error,
     rotation_disagreement,
+    second_order_smoothness,
     step_disagreement,
     translation_disagreement,
 )
@@ -128,8 +129,8 @@ def _evaluate(
         T_warp[..., :3, 3] /= HEIGHTS
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     snippets = batch.snippets()
-    for level in range(loss.scales if disparities and len(snippets.target) > 0 else 0):
-        scale = Level.of(snippets, disparities[level][-len(snippets.target) :], config)
+    for level, disparity in enumerate(disparities if len(snippets.target) > 0 else ()):
+        scale = Level.of(snippets, disparity[-len(snippets.target) :], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
             photometric = photometric + scale.photometric(T_warp, loss)
@@ -138,29 +139,21 @@ def _evaluate(
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if batch.bounds is not None:
-        teacher_terms = _teacher_terms(disparities, T_source_target, batch, batch.bounds, config)
-        terms |= teacher_terms
+        size = (batch.bounds[0].shape[-2], batch.bounds[0].shape[-1])
+        if disparities:
+            levels = [enlarged(disparity, k, size) for k, disparity in enumerate(disparities)]
+            errors = [disagreement(level, batch.bounds, math.log(HEIGHTS)) for level in levels]
+            terms["structure"] = torch.stack(errors).mean()
+            if config.teacher.edge_weight > 0:
+                terms["edge"] = step_disagreement(disparities[0], batch.bounds)
+        T_measured = batch.T_source_target
+        if needs_poses(config) and T_measured is not None:
+            R_wanted, t_wanted = T_measured[..., :3, :3], T_measured[..., :3, 3] / HEIGHTS
+            terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], R_wanted)
+            terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], t_wanted)
         for name, weight in config.teacher.weights.items():
-            total = total + weight * teacher_terms.get(name, total.new_zeros(()))
+            total = total + weight * terms.get(name, total.new_zeros(()))
     return ObjectiveResult(total, terms, disparities)
-
-
-def _teacher_terms(
-    disparities: list[Tensor], T_source_target: Tensor, batch: SnippetBatch, bounds: Bounds, config: ExperimentConfig
-) -> dict[str, Tensor]:
-    """Loss terms of the teacher's labels."""
-    terms: dict[str, Tensor] = {}
-    if disparities:
-        height, width = bounds.least.shape[-2:]
-        levels = [enlarged(disparities[k], k, (height, width)) for k in range(config.loss.scales)]
-        terms["structure"] = torch.stack([disagreement(level, bounds, math.log(HEIGHTS)) for level in levels]).mean()
-        if config.teacher.edge_weight > 0:
-            terms["edge"] = step_disagreement(disparities[0], bounds)
-    T_measured = batch.T_source_target
-    if needs_poses(config) and T_measured is not None:
-        terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
-        terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], T_measured[..., :3, 3] / HEIGHTS)
-    return terms
 
 
 @dataclass(frozen=True)
@@ -192,35 +185,25 @@ class Level:
         count = self.sources.shape[1]
         depth = (1 / self.disparity).repeat_interleave(count, dim=0)  # (B*N, 1, h, w)
         K = self.K.repeat_interleave(count, dim=0)
-        projection = project_into_source(depth, T_source_target.flatten(0, 1), K)
-        warped = sample(self.sources.flatten(0, 1), projection)
+        grid, valid = project_into_source(depth, T_source_target.flatten(0, 1), K)
+        warped = sample(self.sources.flatten(0, 1), grid)
         error = photometric_error(self.target.repeat_interleave(count, dim=0), warped, ssim_weight)
         shape = (len(self.target), count, *error.shape[-2:])
-        return error.reshape(shape), projection.valid.reshape(shape)
+        return error.reshape(shape), valid.reshape(shape)
 
     def photometric(self, T_source_target: Tensor, loss: LossConfig) -> Tensor:
         """Their mean over pixels, reduced over sources as the loss wants it."""
         error, valid = self.errors(T_source_target, loss.ssim_weight)
-        count = self.sources.shape[1]
-        still: Tensor | None = None
-        if loss.auto_mask:
-            with torch.no_grad():
-                before, after = self.sources[:, count // 2 - 1], self.sources[:, count // 2]
-                still = torch.minimum(
-                    photometric_error(self.target, before, loss.ssim_weight),
-                    photometric_error(self.target, after, loss.ssim_weight),
-                )[:, 0]  # (B, h, w)
         if loss.reduction == "mean":
             # pixels without a source count as zero and sources are summed, as in the paper's code
-            summed = (error * valid).sum(dim=1)
-            if still is None:
-                return summed.mean()
-            moving = (summed / valid.sum(1).clamp(min=1) < still) & valid.any(dim=1)
-            return (summed * moving).mean()
+            return (error * valid).sum(dim=1).mean()
         best = error.masked_fill(~valid, torch.inf).amin(dim=1)  # (B, h, w)
-        counted = valid.any(dim=1)
-        if still is not None:
-            counted = counted & (best.detach() < still)
+        middle = self.sources.shape[1] // 2
+        with torch.no_grad():
+            before, after = self.sources[:, middle - 1], self.sources[:, middle]
+            unwarped = [photometric_error(self.target, image, loss.ssim_weight) for image in (before, after)]
+            still = torch.minimum(*unwarped)[:, 0]  # (B, h, w)
+        counted = valid.any(dim=1) & (best.detach() < still)
         return best.masked_fill(~counted, 0).sum() / counted.sum().clamp(min=1)
 
     def smoothness(self, loss: LossConfig) -> Tensor:

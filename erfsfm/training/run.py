@@ -1,4 +1,4 @@
-"""One training run; its output folder is what ``--weights`` takes."""
+"""One training run; its output folder is what ``--weights`` takes. Labels are measured before the first step."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import sys
 import tempfile
 import warnings
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,26 +28,27 @@ from torch.utils.data import DataLoader
 from erfsfm.checkpoint import load_model, take_over
 from erfsfm.common.errors import ConfigError
 from erfsfm.common.files import FolderLock, write_atomically
+from erfsfm.common.processes import opencv_threads
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
-from erfsfm.common.threads import opencv_threads
-from erfsfm.config import ExperimentConfig, Precision
-from erfsfm.data.exact_depth import stacked
+from erfsfm.config import UNTRAINED, ExperimentConfig, dump_yaml
+from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, by_label, labels_mb, stacked
 from erfsfm.data.split import split_recordings, usable
-from erfsfm.evaluation.many_view_truth import many_view_errors
-from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16
-from erfsfm.training.keeper import StepProgress, WeightKeeper
+from erfsfm.evaluation.protocols import many_view_protocol
+from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16, learned_inverse_depth
+from erfsfm.model_record import find_weights, read_record
+from erfsfm.networks.lite0 import Lite0DepthNet
+from erfsfm.training.keeper import MEASUREMENTS, OutputFolder, StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
-from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
-from erfsfm.training.supervision import imitated, measured_views, seen_by_imitated
 
 logger = logging.getLogger(__name__)
 
+_LOGGED_EVERY = 50  # steps: a hundredth of the shortest useful training; a shorter one is logged at its end
 _LEFT_OUT = ("method", "leak")  # the same in all rows
 
 
@@ -92,7 +94,7 @@ def train(
     minutes = config.training.minutes
     timer = Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)  # keeps its time in checkpoints
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(config, training, (done_steps, rank), output, progress)
+    draws = _draws(config, training, done_steps, output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
@@ -104,7 +106,7 @@ def train(
     with raising_on_termination(), FolderLock() as lock:
         if rank == 0:
             lock.take(output)
-            folder.write_config(config)
+            write_atomically(folder.config, dump_yaml(config))
         _fit(trainer, module, loader, validation_loader, folder.checkpoint, resume)
     keeper.save(trainer, module)
     if not trainer.is_global_zero:
@@ -148,22 +150,23 @@ def depth_before_and_after(
     """
     _, validation = split_recordings(config.data)
     cache, rows = config.teacher.cache or output / MEASUREMENTS, []
-    for when, weights in (("before", str(config.initial_weights)), ("after", str(output))):
+    for when, weights in (("before", config.initial_weights), ("after", str(output))):
         networks = DepthPosePredictor.from_weights(weights, device)
-        errors = many_view_errors(networks, validation, cache, True, progress)
+        errors = many_view_protocol(networks, validation, cache, True, progress)
         rows += [{"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT} for row in errors]
     return rows
 
 
 def _draws(
-    config: ExperimentConfig, training: list[Recording], position: tuple[int, int], output: Path, progress: Progress
+    config: ExperimentConfig, training: list[Recording], done_steps: int, output: Path, progress: Progress
 ) -> SnippetDraws:
-    """What this process trains on; ``position``: steps done and rank."""
-    done_steps, rank = position
+    """What this process trains on after some steps."""
     together = config.training.batch * config.training.devices
     views = measured_views(training, config, config.teacher.cache or output / MEASUREMENTS, progress)
     last, done = config.training.steps * together, done_steps * together
-    return SnippetDraws(training, config, last, done, rank, views, imitated(config))
+    imitates = config.teacher.views == "network"
+    imitated = partial(learned_inverse_depth, config.teacher.slam_weights) if imitates else None
+    return SnippetDraws(training, config, last, done, LightningEnvironment().local_rank(), views, imitated)
 
 
 def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> DataLoader[dict[str, Tensor]]:
@@ -209,7 +212,7 @@ def _fit(
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
     """Load initial weights, also of another variant; returns what they were trained on."""
     name, wanted = config.initial_weights, config.network
-    model = load_model(name) if name else None
+    model = None if name in UNTRAINED else load_model(name)
     loaded = {} if model is None else model.networks
     if config.training.networks == "depth" and "pose" not in loaded and needs_poses(config):
         raise ConfigError(
@@ -217,8 +220,8 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
             "is none: name weights that have one as initial_weights, or set teacher.views=many, or "
             "loss.photometric_weight=0"
         )
-    if config.pretrained == "imagenet" and "depth" not in loaded:
-        module.take_imagenet()
+    if name != "none" and "depth" not in loaded and isinstance(module.depth_net, Lite0DepthNet):
+        module.depth_net.encoder.take_imagenet()
     if model is None:
         return []
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "alignment")}
@@ -245,7 +248,12 @@ def _trainer(
 ) -> lightning.Trainer:
     training = config.training
     on_cpu = choose_device(device) == "cpu"
-    precision = _precision_on_cpu(training.precision) if on_cpu else training.precision
+    precision = training.precision
+    if on_cpu and precision != "32-true":
+        precision = "bf16-mixed" if has_bfloat16() else "32-true"
+        if precision != training.precision:
+            said = "training.precision %s does not fit this processor: %s is used"
+            logger.warning(said, training.precision, precision)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     latest = ModelCheckpoint(
         output / "checkpoints",
@@ -272,7 +280,7 @@ def _trainer(
         check_val_every_n_epoch=None,
         val_check_interval=training.validate_every if callbacks[0].validates else None,
         num_sanity_val_steps=0,
-        log_every_n_steps=training.log_every,
+        log_every_n_steps=min(_LOGGED_EVERY, training.steps),
         logger=logs,
         callbacks=[latest, *callbacks, *average],
         plugins=[AtomicCheckpoints()],
@@ -280,15 +288,6 @@ def _trainer(
         enable_model_summary=False,
         default_root_dir=output,
     )
-
-
-def _precision_on_cpu(wanted: Precision) -> Precision:
-    """What the processor computes with."""
-    fitting: Precision = "bf16-mixed" if has_bfloat16() else "32-true"
-    if wanted in ("32-true", fitting):
-        return wanted
-    logger.warning("training.precision %s does not fit this processor: %s is used", wanted, fitting)
-    return fitting
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
@@ -299,3 +298,42 @@ class AtomicCheckpoints(TorchCheckpointIO):
         content = io.BytesIO()  # as in `save_model`
         torch.save(checkpoint, content)
         write_atomically(Path(path), content.getvalue())
+
+
+def seen_by_imitated(config: ExperimentConfig) -> list[str]:
+    """What the imitated network was trained on, and the network that imitates it has then seen, too.
+
+    Raises:
+        CheckpointError: there are no such weights.
+        ConfigError: they have no depth network.
+    """
+    name = config.teacher.slam_weights
+    if config.teacher.views != "network":
+        return []
+    record = read_record(find_weights(name) / "model.yaml")
+    if record.networks == "pose":
+        raise ConfigError(f"teacher.slam_weights '{name}' have no depth network to imitate: name weights that have one")
+    return record.trained_on
+
+
+def measured_views(
+    recordings: list[Recording], config: ExperimentConfig, folder: Path, progress: Progress
+) -> ManyViewTeacher | None:
+    """The teacher, with what is not there yet measured; None where the experiment has no many views.
+
+    Args:
+        recordings: to train on; those with exact depth need no measurement.
+        config: of the experiment.
+        folder: of the measurements.
+        progress: told of the stage, what is done, and of how many.
+    """
+    _, measured = by_label(recordings, config)
+    if config.teacher.views != "many":
+        return None
+    size = (config.network.height, config.network.width)
+    with_depth = config.training.networks != "pose"
+    cache_mb = labels_mb(config.data)
+    learned = partial(learned_inverse_depth, config.teacher.slam_weights)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, with_depth, learned)
+    teacher.prepare(measured, config.network.sources, config.teacher.slam_weights, progress)
+    return teacher

@@ -16,9 +16,9 @@ from erfsfm import __version__
 from erfsfm.common.config_tree import Section, first_problem
 from erfsfm.common.errors import explained
 from erfsfm.common.files import FolderLock
+from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.progress import Progress, progress_bar, progress_lines, silent
 from erfsfm.common.signals import raising_on_termination
-from erfsfm.common.threads import limit_library_threads
 from erfsfm.inference import commit
 from slam.config.sections import SlamConfig, dump_yaml, load_config
 from slam.evaluation.map import double_wall_share

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.threads import side_by_side
+from erfsfm.common.processes import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from erfsfm.common.threads import side_by_side
+from erfsfm.common.processes import side_by_side
 from slam.frames import Descriptors, View
 from slam.geometry.se3 import FloatArray
 from slam.loops.descriptors import hamming

@@ -7,8 +7,8 @@ from contextlib import closing
 
 import numpy as np
 
+from erfsfm.common.processes import CORES, read_ahead
 from erfsfm.common.progress import Progress
-from erfsfm.common.threads import CORES, read_ahead
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import MappingConfig, SlamConfig
 from slam.frames import Intrinsics

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from erfsfm.common.threads import opencv_threads, usable_cores
+from erfsfm.common.processes import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent
 from slam.frontend.drive import LAST_STEPS, Drive

@@ -8,8 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from erfsfm.common.readers.camera_file import HIGHEST_M
-from erfsfm.common.readers.pinhole import impossible
+from erfsfm.common.readers.camera_file import HIGHEST_M, impossible
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor

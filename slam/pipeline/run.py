@@ -9,9 +9,9 @@ from dataclasses import replace
 from functools import cached_property, partial
 from threading import Event
 
+from erfsfm.common.processes import read_ahead
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import calling_on_signals
-from erfsfm.common.threads import read_ahead
 from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import SlamConfig

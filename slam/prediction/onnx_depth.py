@@ -19,9 +19,9 @@ from onnx.external_data_helper import convert_model_from_external_data
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from erfsfm.common.files import read_bytes
+from erfsfm.common.processes import open_session
+from erfsfm.common.readers.camera_file import MOST_PIXELS
 from erfsfm.common.readers.images import resize_image
-from erfsfm.common.readers.pinhole import MOST_PIXELS
-from erfsfm.common.threads import open_session
 from erfsfm.inference import NETWORK_THREADS
 from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image

@@ -18,11 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
 from erfsfm.common.readers import kitti
-from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.camera_file import CameraFile, Pinhole
 from erfsfm.common.readers.images import has_images, list_images, read_depth_map
 from erfsfm.common.readers.kitti import CalibrationFile, OdometryRoot
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
-from erfsfm.common.readers.pinhole import Pinhole
 from slam.formats.ply import read_ply
 from slam.formats.trajectory import read_trajectory
 from slam.geometry import se3

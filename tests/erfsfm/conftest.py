@@ -18,7 +18,7 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split import split_recordings
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 RNG = np.random.default_rng(0)
 WAVES = RNG.uniform(-1.0, 1.0, (12, 2)) * 4.0
@@ -171,7 +171,7 @@ def small() -> dict[str, dict[str, object]]:
     return {
         "network": {"depth_width": 0.0625, "pose_width": 0.125, "sources": 2, "height": 32, "width": 64},
         "data": {"workers": 0, "validation": [], "cache_mb": 50},
-        "training": {"steps": 4, "batch": 2, "checkpoint_every": 2, "log_every": 1, "validate_every": 2},
+        "training": {"steps": 4, "batch": 2, "checkpoint_every": 2, "validate_every": 2},
     }
 
 

@@ -15,7 +15,7 @@ from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 SMALL = ("steps=2", "batch=2", "validate_every=2")
-SMALL_DATA = ("workers=0", "validation_share=0.45", "validation_snippets=1")
+SMALL_DATA = ("workers=0", "validation_share=0.45")
 
 
 @pytest.mark.slow

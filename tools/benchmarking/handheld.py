@@ -109,12 +109,8 @@ def longest_wait(o: JobResult) -> int | None:
     return max(waits, default=None)
 
 
-def _measured(place: int) -> Callable[[JobResult], float | None]:
-    return lambda o: None if o.reason else _error_and_path(o.job)[place]
-
-
-ATE = MetricDefinition("ATE 7-dof (m)", _measured(0), 3)
-PATH = MetricDefinition("path (m)", _measured(1), 1)
+ATE = MetricDefinition("ATE 7-dof (m)", lambda o: None if o.reason else _error_and_path(o.job)[0], 3)
+PATH = MetricDefinition("path (m)", lambda o: None if o.reason else _error_and_path(o.job)[1], 1)
 PERCENT = share("7-dof, % of path", ATE, PATH, 100.0)
 LOSSES = MetricDefinition("losses", losses)
 FIRST_MAP = MetricDefinition("frames before the first map", first_map)

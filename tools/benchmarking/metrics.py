@@ -151,11 +151,6 @@ def over_seeds(definition: MetricDefinition) -> Cell:
     return cell
 
 
-def average(definition: MetricDefinition) -> Cell:
-    """Mean over a group."""
-    return lambda group: mean(values(group, definition), definition.decimals)
-
-
 def middle_and_extreme(definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]) -> Cell:
     """Median and the largest or smallest value of a group."""
     return lambda group: spread(values(group, definition), definition.decimals, extreme)

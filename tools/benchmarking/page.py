@@ -95,7 +95,7 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
     """One row for each kind of recording and weights."""
     columns: dict[str, Cell] = {
         **_COUNTS,
-        "mean ATE 7-dof (m)": m.average(handheld.ATE),
+        "mean ATE 7-dof (m)": lambda group: m.mean(values(group, handheld.ATE), handheld.ATE.decimals),
         "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
         "losses in all": lambda group: f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH,
         "frames before the first map": m.middle_and_extreme(handheld.FIRST_MAP, max),
@@ -178,18 +178,13 @@ def summary_table(results: Sequence[JobResult]) -> str:
         "the network's": m.middle_and_extreme(m.NETWORK_PERCENT, max),
         "over the network's": m.middle_and_extreme(m.OF_NETWORK, max),
         "over the clean drive's": against_clean(results),
-        "drives with a true loop": found,
+        "drives with a true loop": lambda group: f"{sum(n > 0 for n in values(group, m.TRUE_LOOPS))} of {len(group)}",
         "false loops": lambda group: f"{sum(values(group, m.FALSE_LOOPS)):.0f}",
         "frames / s": m.middle_and_extreme(m.RATE, min),
         "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
         "peak RSS (MiB)": m.middle_and_extreme(m.MEMORY, max),
     }
     return table({"drives": kind, "weights": weights}, columns, results)
-
-
-def found(group: Sequence[JobResult]) -> str:
-    """Number of runs with at least one true accepted loop."""
-    return f"{sum(count > 0 for count in values(group, m.TRUE_LOOPS))} of {len(group)}"
 
 
 def against_clean(results: Sequence[JobResult]) -> Cell:

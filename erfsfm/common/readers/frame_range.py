@@ -71,12 +71,8 @@ class FrameRange:
 def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
     """Those of ``names`` that share frames with what was ``seen`` in training; empty where nothing leaks."""
     ranges = [FrameRange.parse(name) for name in seen]
-
-    def leaks(name: str) -> bool:
-        wanted = FrameRange.parse(name)
-        return any(wanted.covers(each) for each in ranges)
-
-    return [name for name in names if leaks(name)]
+    wanted = [(name, FrameRange.parse(name)) for name in names]
+    return [name for name, frames in wanted if any(frames.covers(each) for each in ranges)]
 
 
 def merge(names: Iterable[str]) -> list[str]:
@@ -89,7 +85,14 @@ def merge(names: Iterable[str]) -> list[str]:
             others.add(str(FrameRange.parse(name)))
         else:
             seeds |= set(range(span[0], span[1] + 1))
-    return _seed_ranges(sorted(seeds)) + sorted(others)
+    runs: list[list[int]] = []
+    for seed in sorted(seeds):
+        if runs and runs[-1][-1] + 1 == seed:
+            runs[-1].append(seed)
+        else:
+            runs.append([seed])
+    ranges = [f"simulated/{r[0]}" if len(r) == 1 else f"simulated/{r[0]}-{r[-1]}" for r in runs]
+    return ranges + sorted(others)
 
 
 def seed_span(recording: str) -> tuple[int, int] | None:
@@ -107,13 +110,3 @@ def _drive(recording: str) -> tuple[str, int, int]:
         return recording, 0, EVERYTHING
     drive, first, past_last = ODOMETRY_DRIVES[name]
     return f"kitti_raw/{drive}", first, past_last - first
-
-
-def _seed_ranges(seeds: list[int]) -> list[str]:
-    runs: list[list[int]] = []
-    for seed in seeds:
-        if runs and runs[-1][-1] + 1 == seed:
-            runs[-1].append(seed)
-        else:
-            runs.append([seed])
-    return [f"simulated/{r[0]}" if len(r) == 1 else f"simulated/{r[0]}-{r[-1]}" for r in runs]

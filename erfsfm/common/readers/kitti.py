@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.files import read_bytes, read_text
+from erfsfm.common.readers.camera_file import Pinhole, require_plausible
 from erfsfm.common.readers.images import has_images, natural_key
-from erfsfm.common.readers.pinhole import Pinhole, require_plausible
 
 FloatArray = NDArray[np.float64]
 

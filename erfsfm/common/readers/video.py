@@ -45,7 +45,12 @@ class VideoFrames:
         self._times_ms: list[float] = []
         self._capture = _capture(path)
         announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        shown_s = _packet_times(path) if announced > counted_frames else self._decoded_times()
+        if announced > counted_frames:
+            shown_s = _packet_times(path)
+        else:
+            while self._grab():
+                pass
+            shown_s = np.array(self._times_ms) / 1000
         self._frames = announced if shown_s is None else len(shown_s)
         if self._frames <= 0:
             raise DataError(f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)")
@@ -80,11 +85,6 @@ class VideoFrames:
                 self._path,
             )
         return self._shown_s
-
-    def _decoded_times(self) -> NDArray[np.float64]:
-        while self._grab():
-            pass
-        return np.array(self._times_ms) / 1000
 
     def _decode(self, index: int) -> Image:
         ahead = index - self._next

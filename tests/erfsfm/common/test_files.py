@@ -69,11 +69,11 @@ def test_who_waits_holds_a_folder_after_the_other(tmp_path: Path) -> None:
 
     def wait() -> None:
         with FolderLock() as other:
-            other.wait_for(tmp_path)
+            other.take(tmp_path, waits=True)
             events.append("waited")
 
     with FolderLock() as lock:
-        lock.wait_for(tmp_path)
+        lock.take(tmp_path, waits=True)
         thread = Thread(target=wait)
         thread.start()
         thread.join(0.3)

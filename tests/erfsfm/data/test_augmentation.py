@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from erfsfm.config import DataConfig
 from erfsfm.data.augmentation import augment, rolled, weathered
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 CAMERA = Camera(width=160, height=96, fx=110.0, fy=120.0, cx=77.0, cy=50.0)
 POINTS = np.random.default_rng(2).uniform([-0.3, -0.15, 1.0], [0.3, 0.15, 1.5], (5, 3))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,15 @@ import torch
 from torch.utils.data import DataLoader
 
 from erfsfm.config import ExperimentConfig
+from erfsfm.data.augmentation import FOCAL_LENGTH
 from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
-from erfsfm.data.exact_depth import FARTHEST_M, stacked
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.data.samples import FOCAL_LENGTH
-from erfsfm.data.snippets import SnippetDraws, chances
+from erfsfm.data.snippets import FARTHEST_M, SnippetDraws, chances, stacked
 from erfsfm.data.split import split_recordings
 from erfsfm.data.window import HEIGHTS
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import DepthPosePredictor, learned_inverse_depth
 from erfsfm.model_record import find_weights, read_record
 from erfsfm.training.run import prepare, train
-from erfsfm.training.supervision import imitated
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.rooms import SimulatedRooms
@@ -164,7 +163,9 @@ def imitation(root: Path) -> ExperimentConfig:
 def test_the_label_is_what_the_network_gives(write_root: Callable[..., Path], tmp_path: Path) -> None:
     config = imitation(write_root(tmp_path / "real", 5))
     recordings, _ = split_recordings(config.data)
-    sample = SnippetDraws(recordings, config, 1, imitated=imitated(config)).draw(0)
+    sample = SnippetDraws(
+        recordings, config, 1, imitated=partial(learned_inverse_depth, config.teacher.slam_weights)
+    ).draw(0)
     shown = sample["target"].permute(1, 2, 0).numpy()
     original = np.ascontiguousarray(shown[:, ::-1])  # every image is mirrored
     disparity = 1 / DepthPosePredictor.from_weights("sim", "cpu", "onnx").depth(original)[:, ::-1]

@@ -18,8 +18,8 @@ from torch.utils.data import DataLoader
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
+from erfsfm.data.augmentation import FOCAL_LENGTH
 from erfsfm.data.discovery import discover
-from erfsfm.data.samples import FOCAL_LENGTH
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
 from erfsfm.data.split import Split, read_split_file, split_recordings
 from erfsfm.data.window import snippet_motion
@@ -167,8 +167,9 @@ def test_weights_set_the_probabilities(coded: Path) -> None:
 # validation
 
 
-def test_validation_is_even_and_always_the_same(coded: Path) -> None:
-    config = experiment(validation_snippets=3)
+def test_validation_is_even_and_always_the_same(coded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("erfsfm.data.snippets._VALIDATED", 3)
+    config = experiment()
     snippets = ValidationSnippets(discover(coded)[:1], config)
     assert [frames_of(snippets[k]) for k in range(len(snippets))] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
     assert equal(snippets[1], ValidationSnippets(discover(coded)[:1], config)[1])
@@ -244,18 +245,16 @@ def drives(config: DataConfig) -> tuple[set[str], set[str]]:
 
 def test_eigens_scenes_and_test_sequences_are_left_out(raw: Path) -> None:
     assert drives(DataConfig(roots=[raw])) == ({"drive_0001", "drive_0005"}, set())
-    everything = DataConfig(roots=[raw], leave_out="none", exclude=[])
+    everything = DataConfig(roots=[raw], exclude=[])
     assert drives(everything)[0] == {"drive_0001", "drive_0005", "drive_0013", "drive_0027", "drive_0033"}
-    assert "drive_0033" not in drives(DataConfig(roots=[raw], leave_out="none"))[0], "it is sequence 09"
+    assert "drive_0033" not in drives(DataConfig(roots=[raw], exclude=["kitti_odometry/09"]))[0]
 
 
 def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO"):
-        training, _ = names(DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"]))
+        training, _ = names(DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005", "eigen"]))
     assert training[:2] == ["kitti_raw/2011_09_26_drive_0001[0:3]", "kitti_raw/2011_09_26_drive_0001[4:6]"]
     assert "4 of 24 frames" in caplog.text
-    kept = DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"], static_frames="keep")
-    assert names(kept)[0][0] == "kitti_raw/2011_09_26_drive_0001[0:6]"
 
 
 def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]) -> None:

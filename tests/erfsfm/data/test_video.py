@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import pickle
-from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.readers.images import read_image
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data import many_view_teacher
 from erfsfm.data import recordings as module
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording, Video
-from erfsfm.geometry.camera import Camera
+from erfsfm.geometry import Camera
 
 FRAMES, SIZE = 40, (48, 32)
 
@@ -69,11 +70,15 @@ def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path: Path, monkeyp
     whole = Recording("folder/a", (video.path,) * len(video), Camera(48, 32, 40.0, 40.0, 23.5, 15.5), video)
     numbers: list[int] = []
 
-    def drive_poses(name: str, images: Iterable[np.ndarray], camera: Camera, weights: str) -> np.ndarray:
-        numbers.extend(number(image) for image in images)
-        return np.tile(np.eye(4), (len(numbers), 1, 1))
+    def slam(words: list[str]) -> str:
+        images, output = (Path(words[words.index(option) + 1]) for option in ("--dataset", "--output"))
+        numbers.extend(number(read_image(path)) for path in sorted(images.glob("*.png")))
+        output.mkdir()
+        np.savetxt(output / "trajectory_optimised.kitti.txt", np.tile(np.eye(4)[:3].ravel(), (len(numbers), 1)))
+        (output / "metrics.json").write_text(json.dumps({"scale": {"mode": "camera-height"}}))
+        return ""
 
-    monkeypatch.setattr(many_view_teacher, "drive_poses", drive_poses)
+    monkeypatch.setattr(many_view_teacher, "slam_process", slam)
     teacher = ManyViewTeacher(tmp_path / "measured", (16, 24), stride=2, with_depth=False)
     teacher.prepare([whole.part(20, 24)], 2, "sim", lambda *_: None)
     assert numbers == [20, 21, 22, 23]

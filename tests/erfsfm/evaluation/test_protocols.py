@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,8 +13,21 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import ExperimentConfig
-from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
+from erfsfm.data.discovery import discover
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.evaluation.depth_metrics import mean_ratio, standard_error
+from erfsfm.evaluation.protocols import (
+    EVERY,
+    TRUTH_FOLDER,
+    depth_protocol,
+    many_view_protocol,
+    named_recordings,
+    pose_protocol,
+)
 from erfsfm.training.run import prepare
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.street import SimulatedStreet
 
 
 class Oracle:
@@ -55,10 +69,10 @@ def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small:
     """It holds smaller images than depth maps, and depth of the middle of each snippet alone."""
     roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
     roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
-    data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3}
+    data = {"roots": roots, "validation": ["simulated/500"]}
     prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
     networks, _ = depth_protocol({"networks": Oracle(STEP)}, [tmp_path / "prepared"], allow_leak=False)
-    assert networks["images"] == 3
+    assert networks["images"] == 9
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
 
 
@@ -87,3 +101,176 @@ def test_paper_fidelity_counts_four_empty_snippets(tmp_path: Path, write_root: C
     default = pose_protocol(Oracle(STEP), tmp_path, ["00"], "default", allow_leak=False)[1]
     paper = pose_protocol(Oracle(STEP), tmp_path, ["00"], "paper", allow_leak=False)[1]
     assert paper["ate_mean"] == pytest.approx(default["ate_mean"] * 5 / 9)
+
+
+class Flat:
+    """A depth of 3 everywhere."""
+
+    sources = 4
+
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return np.full(image.shape[:2], 3.0, np.float32)
+
+    def leaks(self, names: list[str]) -> list[str]:
+        return [name for name in names if name.startswith("kitti_odometry/")]
+
+
+class Slanted(Flat):
+    """Depth that grows to the right."""
+
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return super().depth(image) * np.linspace(1, 2, image.shape[1], dtype=np.float32)
+
+
+def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
+    """Images with four known depths: 10 m, and one of 20 m where ``farther``, which makes an AbsRel of 0.125."""
+    for folder in ("images", "truth"):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    for index, with_far in enumerate(farther):
+        cv2.imwrite(str(root / "images" / f"{street}_{index:06d}.jpg"), np.zeros((64, 96, 3), np.uint8))
+        truth = np.zeros((64, 96), np.uint16)
+        truth[[40, 40, 50, 50], [40, 50, 40, 50]] = 2560
+        truth[50, 50] *= 1 + with_far
+        truth[2, 2] = 60 * 256  # outside the crop
+        cv2.imwrite(str(root / "truth" / f"{street}_{index:06d}.png"), truth)
+
+
+def test_standard_error_and_ratio_are_those_over_streets() -> None:
+    assert standard_error([1.0, 3.0]) == pytest.approx(1.0), "a standard deviation of sqrt(2) of two streets"
+    assert standard_error([1.0]) is None
+    ratio, error = mean_ratio([0.1, 0.4], to=[0.2, 0.2])
+    assert ratio == pytest.approx(1.0) and error == pytest.approx(np.log(2))
+    assert mean_ratio([0.1], to=[0.2]) == (pytest.approx(0.5), None)
+
+
+def test_streets_count_alike_and_have_standard_errors(tmp_path: Path) -> None:
+    write_pairs(tmp_path / "pairs", "06", [True] * 5 + [False] * 5)
+    write_pairs(tmp_path / "pairs", "08", [False] * 20)
+    rows = depth_protocol({"networks": Flat()}, [tmp_path / "pairs"], allow_leak=False)
+    mean, first, second = rows
+    assert [row["street"] for row in (first, second)] == ["folder/pairs/06", "folder/pairs/08"]
+    assert [row["images"] for row in rows] == [30, 10, 20]
+    assert first["abs_rel"] == pytest.approx(0.0625)
+    assert second["abs_rel"] == 0
+    assert mean["abs_rel"] == mean["abs_rel_se"] == pytest.approx(0.0625 / 2), "not by their images"
+    assert first["abs_rel_se"] is None and first["abs_rel_se_reason"] == "one street"
+    assert mean["a1"] == pytest.approx((1 - 0.25 / 2 + 1) / 2)
+
+
+def test_a_picture_of_each_street_shows_image_depths_and_truth(tmp_path: Path) -> None:
+    write_pairs(tmp_path / "pairs", "06", [True, False])
+    networks = {"a": Flat(), "b": Slanted()}
+    depth_protocol(networks, [tmp_path / "pairs"], allow_leak=False, pictures=tmp_path / "pictures")
+    (file,) = (tmp_path / "pictures").iterdir()
+    assert file.name == "folder-pairs-06.jpg"
+    image, flat, slanted, truth = np.split(cv2.imread(str(file)).astype(int).sum(axis=2), 4)
+    assert image.max() < 30 and np.ptp(flat) < 30
+    assert slanted[:, 0].mean() > slanted[:, -1].mean() + 100, "near is bright"
+    assert truth[40, 40] > truth[50, 50] + 100 > truth[20, 20] + 200, "unknown is dark"
+
+
+def test_networks_are_compared_street_by_street(tmp_path: Path) -> None:
+    write_pairs(tmp_path / "pairs", "06", [True] * 4)
+    write_pairs(tmp_path / "pairs", "08", [True, False])
+    mean, other, *single = depth_protocol({"a": Flat(), "b": Slanted()}, [tmp_path / "pairs"], allow_leak=False)
+    assert "ratio" not in mean
+    assert [(row["method"], row["street"][-2:]) for row in single] == [
+        ("a", "06"),
+        ("b", "06"),
+        ("a", "08"),
+        ("b", "08"),
+    ]
+    ratios = [single[1]["ratio"], single[3]["ratio"]]
+    assert ratios[0] == pytest.approx(single[1]["abs_rel"] / single[0]["abs_rel"])
+    assert other["ratio"] == pytest.approx(np.sqrt(np.prod(ratios)))
+    assert other["ratio_se"] == pytest.approx(other["ratio"] * abs(np.log(ratios[0] / ratios[1])) / 2)
+
+
+def test_drives_with_lidar_and_worlds_are_streets(
+    tmp_path: Path, write_drive: Callable[..., Path], write_root: Callable[..., Path]
+) -> None:
+    roots = [write_drive(tmp_path / "raw"), write_root(tmp_path / "world", frames=11, depth=True, seed=600)]
+    rows = depth_protocol({"networks": Flat()}, roots, allow_leak=False)  # type: ignore[arg-type]
+    assert [row.get("street") for row in rows] == [None, "kitti_raw/2011_09_26_drive_0099", "simulated/600"]
+    assert [row["images"] for row in rows] == [5, 2, 3], "every fifth frame"
+    assert rows[0]["abs_rel"] == pytest.approx(0, abs=1e-3)
+    assert rows[0]["abs_rel_se"] == pytest.approx(0, abs=1e-3)
+
+
+def test_a_leak_of_one_street_is_refused(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_pairs(tmp_path / "pairs", "06", [True])
+    roots = [tmp_path / "pairs", write_root(tmp_path / "kitti", frames=2, depth=True)]
+    with pytest.raises(DataError, match=r"leak: .* kitti_odometry/00\[0:2\]"):
+        depth_protocol({"networks": Flat()}, roots, allow_leak=False)  # type: ignore[arg-type]
+    rows = depth_protocol({"networks": Flat()}, roots, allow_leak=True)  # type: ignore[arg-type]
+    assert [row["leak"] for row in rows] == [True, False, True]
+
+
+HEIGHT_M = 1.65
+
+
+class Networks:
+    """True depth in another scale, or the same depth everywhere."""
+
+    sources = 4
+
+    def __init__(self, recording, right):
+        self._images = [recording.image(i, 128, 416).tobytes() for i in range(len(recording))]
+        self._recording, self._right = recording, right
+        self.seen = []
+
+    def depth(self, image):
+        if not self._right:
+            return np.ones(image.shape[:2], np.float32)
+        true = self._recording.true_depth(self._images.index(image.tobytes()))
+        return np.where(true > 0, true, 1e3).astype(np.float32) / 7
+
+    def poses(self, images):
+        raise AssertionError("not asked for")
+
+    def leaks(self, names):
+        return self.seen
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    root = tmp_path_factory.mktemp("world") / "world"
+    street = SimulatedStreet(SimulationOptions(frames=13, seed=707, route="straight", width=416, height=128))
+    write_kitti_root(street, root, depth=True)
+    return root
+
+
+@pytest.fixture(scope="module")
+def cache(world, tmp_path_factory):
+    """The drive's poses as a run would leave them, so that none is needed."""
+    folder, recording = tmp_path_factory.mktemp("cache"), discover(world)[0]
+    T_world_camera = recording.true_poses().copy()
+    T_world_camera[:, :3, 3] /= HEIGHT_M
+    ManyViewTeacher(folder / TRUTH_FOLDER, (128, 416), EVERY).drive(recording).keep_poses(T_world_camera)
+    return folder
+
+
+def rows_of(networks, world, cache, sequences=(), allow_leak=False):
+    recordings = [part for name in sequences or [""] for part in named_recordings(world, name)]
+    return many_view_protocol(networks, recordings, cache, allow_leak, lambda *_: None)
+
+
+def test_true_depth_is_right_and_constant_depth_is_wrong(world, cache):
+    recording = discover(world)[0]
+    (right,) = rows_of(Networks(recording, right=True), world, cache)
+    (wrong,) = rows_of(Networks(recording, right=False), world, cache)
+    assert right["images"] == wrong["images"] == 2, "every fifth frame that has two neighbours on either side"
+    assert right["abs_rel"] < 0.08 < 0.2 < wrong["abs_rel"]
+    assert 0.3 < right["known"] == wrong["known"] < 1
+    assert right["recording"] == "simulated/707[0:13]" and right["leak"] is False
+
+
+def test_leaks_and_recordings_that_are_not_there_are_refused(world, cache):
+    networks = Networks(discover(world)[0], right=False)
+    with pytest.raises(DataError, match="no sequence 7"):
+        rows_of(networks, world, cache, ["7"])
+    networks.seen = ["simulated/707"]
+    with pytest.raises(DataError, match="leak"):
+        rows_of(networks, world, cache)
+    (row,) = rows_of(networks, world, cache, allow_leak=True)
+    assert row["leak"] is True

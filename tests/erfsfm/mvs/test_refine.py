@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.refine import RefinedDepth, measure
-from erfsfm.mvs.sweep import EDGE_GREY_LEVELS, LARGE_STEP, SMALL_STEP, UNIT, smoothed
+from erfsfm.mvs.refine import EDGE_GREY_LEVELS, LARGE_STEP, SMALL_STEP, UNIT, RefinedDepth, measure, smoothed
 from erfsfm.mvs.views import Appearance
 
 H, W = 96, 240

@@ -55,7 +55,7 @@ def test_imagenet_weights_keep_the_scale():
 
 def test_batch_statistics_stay_and_frozen_stages_have_no_gradient():
     network = build("depthnet-lite0").train()
-    network.encoder.freeze(3)
+    network.encoder.stages[:3].requires_grad_(False)
     norms = [m for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)]
     before = [m.running_mean.clone() for m in norms]
     network(torch.rand(2, 3, 64, 96))[0].sum().backward()

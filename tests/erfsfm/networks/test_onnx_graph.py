@@ -122,7 +122,7 @@ def test_a_damaged_graph_is_made_again() -> None:
     assert kept_graph("one", b"another") == b"graph"
 
 
-@pytest.mark.parametrize("changed", ["networks/blocks.py", "geometry/alignment.py"])
+@pytest.mark.parametrize("changed", ["networks/blocks.py", "geometry.py"])
 def test_a_graph_of_older_code_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
     package = shutil.copytree(Path(onnx_graph.__file__).parents[1], tmp_path / "code", ignore=NO_CODE)
     monkeypatch.setattr(onnx_graph, "__file__", str(package / "networks" / "onnx_graph.py"))

@@ -66,7 +66,7 @@ def held_out(drives: Path, write_root: Callable[..., Path]) -> Path:
 
 
 def configure(small: Small, roots: list[Path], **sections: dict[str, Any]) -> ExperimentConfig:
-    data = {"roots": roots, "validation": ["simulated/500-599"], "validation_snippets": 3}
+    data = {"roots": roots, "validation": ["simulated/500-599"]}
     tree = {
         name: small.get(name, {}) | ({"data": data}.get(name, {})) | sections.get(name, {})
         for name in {*small, *sections}
@@ -132,7 +132,7 @@ def test_the_folder_can_be_used(both: Configure, tmp_path: Path) -> None:
     with (output / "logs" / "csv" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     steps = [int(row["step"]) for row in rows if row["loss"]]
-    assert steps == [0, 1, 2, 3]
+    assert steps == [3], "a short training is logged at its end"
     assert any(row["validation/abs_rel"] for row in rows)
 
 

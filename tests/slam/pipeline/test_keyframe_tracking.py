@@ -6,7 +6,7 @@ import pytest
 import room
 from oracle import OraclePredictor
 
-from erfsfm.common.threads import opencv_threads
+from erfsfm.common.processes import opencv_threads
 from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
-from erfsfm.common.readers.pinhole import Pinhole
+from erfsfm.common.readers.camera_file import CameraFile, Pinhole, read_camera_file
 from slam.sequences.catalogue import open_sequence
 
 FIRST_NS, STEP_NS, FRAMES = 1403715273262142976, 100_000_000, 8

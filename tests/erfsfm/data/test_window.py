@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.data.array_cache import ArrayCache, ImageCache
+from erfsfm.data.window import ArrayCache, Snippet, load_window
 
 HEIGHT, WIDTH = 256, 512
 
@@ -26,9 +26,10 @@ class Painted:
 
 @pytest.mark.parametrize("limit_mb, decoded", [(10, [0, 1]), (0, [0, 1, 0, 1])])
 def test_decodes_once_while_there_is_room(limit_mb: int, decoded: list[int]) -> None:
-    recording, cache = Painted(), ImageCache(limit_mb, HEIGHT, WIDTH)
+    recording, cache = Painted(), ArrayCache(limit_mb, (HEIGHT, WIDTH, 3), np.uint8)
     for index in (0, 1, 0, 1):
-        assert (cache.image(recording, index) == index).all()  # type: ignore[arg-type]
+        (image,) = load_window(cache, Snippet(recording, index), 1)  # type: ignore[arg-type]
+        assert (image == index).all()
     assert recording.decoded == decoded
 
 

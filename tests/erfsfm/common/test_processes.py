@@ -11,7 +11,7 @@ import cv2
 import pytest
 from threadpoolctl import threadpool_info
 
-from erfsfm.common.threads import limit_library_threads, read_ahead
+from erfsfm.common.processes import limit_library_threads, read_ahead
 
 
 def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
@@ -33,7 +33,7 @@ def test_one_process_of_many_starts_no_threads() -> None:
     program = (
         "import cv2, numpy\n"
         "from threadpoolctl import threadpool_info\n"
-        "from erfsfm.common.threads import stay_single_threaded, usable_cores\n"
+        "from erfsfm.common.processes import stay_single_threaded, usable_cores\n"
         "cv2.setNumThreads(3)\n"
         "stay_single_threaded()\n"
         "counts = [pool['num_threads'] for pool in threadpool_info()]\n"

@@ -1,1 +1,0 @@
-"""Cameras, rigid transforms and the differentiable inverse warp."""

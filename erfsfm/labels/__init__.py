@@ -1,1 +1,0 @@
-"""Pseudo-labels of depth and motion, measured in the training images by two or many views."""

@@ -196,15 +196,14 @@ class FolderRecorder(Recorder):
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""
-        sequence, output = self.pipeline.sequence, self._settings.output
         depth = self._quality.metrics(self._settings.depth.refine != "none")
-        timing = timing_of(self._stopwatch, len(sequence))
+        timing = timing_of(self._stopwatch, len(self.pipeline.sequence))
         metrics = self._metrics.changed(status="ok", reason=None, timing=timing, depth=depth)
 
         def reported() -> None:
-            if output.report:
-                view = map_view(self.folder, output.viewer_triangles)
-                write_report(self.folder, self._depths.pictures(), self._loop_pictures(estimate), view, metrics)
+            if self._settings.output.report:
+                pictures = self._depths.pictures(), self._loop_pictures(estimate)
+                write_report(self.folder, *pictures, map_view(self.folder), metrics)
 
         self._progress("report", 0, 1)
         attempt("the report", reported)

@@ -22,7 +22,7 @@ from slam.simulation.options import SimulationOptions
 FACTOR = 0.2
 FRAMES = 250
 NOISE = OracleNoise(np.deg2rad(0.3), 0.05, 0.005, 0.15, seed=3)
-SETTINGS = ["visual_odometry.enabled=false", "mapping.enabled=false", "loops.frame_stride=3"]
+SETTINGS = ["visual_odometry.enabled=false", "mapping.enabled=false"]
 
 
 @functools.cache

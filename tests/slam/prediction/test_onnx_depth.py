@@ -90,12 +90,12 @@ def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: Mak
     model.graph.node.append(helper.make_node("Reshape", ["whole", "shape"], ["depth"]))
     onnx.save(model, path)
     with pytest.raises(SlamError, match=r"net\.onnx fails on an image of 32x16: .*"):
-        opened(path, height=16, width=32)
+        opened(path, size=(16, 32))
     with pytest.raises(
         SlamError,
         match=r"must be floats of one map \(1, 1, H, W\) of at most 67,108,864 pixels; got float32 \(2, 14, 14\)",
     ):
-        opened(path, height=14, width=28)
+        opened(path, size=(14, 28))
 
 
 def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path) -> None:

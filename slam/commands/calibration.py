@@ -128,7 +128,7 @@ def calibrate_camera(
     )
     Undistortion(camera)  # refuses a lens that cannot be undistorted
     text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
-    write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"))
+    write_atomically(output, text)
     _write_picture(picture, fit, camera, images)
     lines = [
         f"fx {camera.fx:g}, fy {camera.fy:g} ± {100 * fit.focal_sigma:.2f} %, cx {camera.cx:g}, cy {camera.cy:g}, "

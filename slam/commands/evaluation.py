@@ -50,8 +50,7 @@ def against_reference(
         check_replaced(csv, b"system,path")
     runs = compare(named_paths(paths), reference, format, frames)
     if csv is not None:
-        content = csv_of(dict(_flat(run.tree())) for run in runs)
-        write_atomically(csv, lambda partial: partial.write_text(content, encoding="utf-8", newline=""), RunError)
+        write_atomically(csv, csv_of(dict(_flat(run.tree())) for run in runs), RunError)
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -217,7 +216,7 @@ def _write_scene(
     poses = {k: (trajectory.T_world_camera[k] @ _T_CAMERA_OPENGL).tolist() for k in frames}
     scene["frames"] = [{"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()]
     text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
-    write_atomically(output / TRANSFORMS, lambda file: file.write_text(text, encoding="utf-8"), RunError)
+    write_atomically(output / TRANSFORMS, text, RunError)
 
 
 def _write_images(
@@ -235,7 +234,7 @@ def _write_images(
         except (SlamError, ErfsfmError):
             continue
         content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-        write_atomically(output / _image_name(k), partial(Path.write_bytes, data=content), RunError)
+        write_atomically(output / _image_name(k), content, RunError)
         written.append(k)
     if not written:
         raise RunError(f"no image of {folder.path} can be read: check the data set")

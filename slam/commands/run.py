@@ -44,7 +44,7 @@ from slam.results.truth import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
 from slam.runtime.imports import import_extra
 from slam.runtime.run_files import CONFIG, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
-from slam.runtime.storage.files import from_anywhere
+from slam.runtime.storage.files import from_anywhere, source_from_anywhere
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.gps import read_gps
 
@@ -124,11 +124,9 @@ class FolderRecorder(Recorder):
     def begin(self) -> None:
         """The metrics and settings of a run that begins; the source of depth by its whole path."""
         self.folder.write_metrics(self._metrics)
-        settings, (kind, colon, path) = self._settings, self._settings.depth.source.partition(":")
-        if colon:
-            depth = settings.depth.model_copy(update={"source": f"{kind}:{from_anywhere(path)}"})
-            settings = settings.model_copy(update={"depth": depth})
-        self.folder.write_text(CONFIG, dump_yaml(settings))
+        depth = self._settings.depth
+        depth = depth.model_copy(update={"source": source_from_anywhere(depth.source)})
+        self.folder.write(CONFIG, dump_yaml(self._settings.model_copy(update={"depth": depth})))
 
     def trajectory(self, name: str, trajectory: Trajectory) -> None:
         """On disk in both formats."""
@@ -144,7 +142,7 @@ class FolderRecorder(Recorder):
             folder.write_trajectory("lidar", lidar)
         if not isinstance(estimate.graph, Failed):
             estimate.graph.write_g2o(folder.path / GRAPH)
-        folder.write_text(LOOPS, json.dumps(estimate.loops.details(), indent=2, allow_nan=False))
+        folder.write(LOOPS, json.dumps(estimate.loops.details(), indent=2, allow_nan=False))
         folder.write(PLACES, estimate.places(sequence.intrinsics).write)
         with estimate.stopwatch.stage("evaluation"):
             self._metrics = estimate_metrics(estimate, sequence, self._provenance, self._settings.gps.factors)

@@ -86,17 +86,13 @@ class RunFolder:
             logger.warning("%s: %s: files that are there are whole", path, metrics.failure)
         return folder
 
-    def write_text(self, name: str, text: str) -> None:
-        """Write a text file atomically."""
-        self.write(name, lambda path: path.write_text(text, encoding="utf-8"))
-
-    def write(self, name: str, fill: Callable[[Path], object]) -> None:
-        """Write a file atomically: ``fill`` writes it under a temporary name."""
-        write_atomically(self.path / name, fill, RunError)
+    def write(self, name: str, content: str | Callable[[Path], object]) -> None:
+        """Write a file atomically: its text, or by a function that writes it under a temporary name."""
+        write_atomically(self.path / name, content, RunError)
 
     def write_metrics(self, metrics: Metrics) -> None:
         """Write ``metrics.json``."""
-        self.write_text(METRICS, metrics.to_json() + "\n")
+        self.write(METRICS, metrics.to_json() + "\n")
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
         """Write one of the trajectories (``network``, ``optimised``, ``reference`` ...) in both formats."""

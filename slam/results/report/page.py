@@ -84,7 +84,7 @@ def write_report(
         loop_pictures=loops,
         no_loops=_absence(metrics, metrics.loops.absent),
     )
-    folder.write_text(REPORT, page)
+    folder.write(REPORT, page)
 
 
 def _absence(metrics: Metrics, reason: str) -> str:

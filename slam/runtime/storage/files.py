@@ -10,7 +10,10 @@ from slam.runtime.errors import SlamError
 
 
 def write_atomically(
-    path: Path, fill: Callable[[Path], object], error: type[SlamError] = SlamError, sync: bool = True
+    path: Path,
+    content: str | bytes | Callable[[Path], object],
+    error: type[SlamError] = SlamError,
+    sync: bool = True,
 ) -> None:
     """`erfsfm.common.files.write_atomically` that raises a `SlamError`.
 
@@ -18,9 +21,15 @@ def write_atomically(
         SlamError: (or the given kind) the file cannot be written.
     """
     try:
-        files.write_atomically(path, fill, sync)
+        files.write_atomically(path, content, sync)
     except OSError as cause:
         raise error(str(cause)) from cause
+
+
+def source_from_anywhere(source: str) -> str:
+    """``depth.source`` with its file or folder, where it has one, by the whole path."""
+    kind, colon, path = source.partition(":")
+    return f"{kind}:{from_anywhere(path)}" if colon else source
 
 
 def from_anywhere(name_or_path: str | Path) -> str:

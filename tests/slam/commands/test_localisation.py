@@ -61,7 +61,7 @@ def places() -> Places:
 def run(make_run: Callable[..., RunFolder]) -> RunFolder:
     folder = make_run()
     folder.write(PLACES, places().write)
-    folder.write_text("config.yaml", dump_yaml(load_config()))
+    folder.write("config.yaml", dump_yaml(load_config()))
     return folder
 
 

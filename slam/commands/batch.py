@@ -32,7 +32,7 @@ from slam.results.tables import written
 from slam.runtime.errors import RunError, SequenceError, SlamError
 from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import from_anywhere, source_from_anywhere, write_atomically
-from slam.sequences.catalogue import sequence_names
+from slam.sequences.catalogue import sequence_kinds
 from slam.sequences.recording import frame_range
 
 CSV = "drives.csv"
@@ -225,7 +225,7 @@ def summary_table(outcomes: Sequence[Outcome]) -> Table:
 
 
 def _of_data_set(root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
-    names = sequence_names(root)
+    names = list(sequence_kinds(root))
     if not names:
         raise SequenceError(f"{root} is no manifest ({_MANIFEST}) and holds no sequences")
     missing = [name for name in sequences if name != "all" and name not in names]

@@ -18,7 +18,7 @@ from erfsfm.common.files import refuse_foreign
 from erfsfm.common.progress import Progress, silent
 from slam.commands.occupancy import occupancy_grid, write_ros_map
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
-from slam.formats.ply import Ply, read_ply, rotated, write_ply
+from slam.formats.ply import R_UP_WORLD, Ply, read_ply, rotated, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
 from slam.frames import Intrinsics, Sequence
 from slam.geometry import se3
@@ -35,11 +35,7 @@ from slam.sequences.catalogue import open_sequence
 
 logger = logging.getLogger(__name__)
 
-# from a camera's x right, y down, z ahead
-R_UP_WORLDS = {
-    "y-down": np.eye(3),
-    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # x right, y ahead, z up
-}
+R_UP_WORLDS = {"y-down": np.eye(3), "z": R_UP_WORLD}  # from a camera's x right, y down, z ahead
 POINTS, TRANSFORMS = "points.ply", "transforms.json"
 _IMAGES = "images"
 _MADE_BY = {"made_by": "erfsfm-slam"}

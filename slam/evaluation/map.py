@@ -23,6 +23,7 @@ from slam.mapping.views import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part
+from slam.simulation.surface import scene_of
 
 NEAR_CAMERA_M = 20.0
 COVERED_WITHIN_M = 0.3
@@ -258,10 +259,8 @@ def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) ->
 def _has_parallel_before(
     vertices: FloatArray, triangles: NDArray[np.int64], points: FloatArray, direction: FloatArray
 ) -> NDArray[np.bool_]:
-    o3d = import_open3d()
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
+    scene = scene_of(vertices.astype(np.float32), triangles.astype(np.uint32))
     rays = np.concatenate([points + _WALL_NEAR_M * direction, direction], axis=1).astype(np.float32)
-    answer = scene.cast_rays(o3d.core.Tensor(rays))
+    answer = scene.cast_rays(import_open3d().core.Tensor(rays))
     cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)
     return np.asarray((answer["t_hit"].numpy() <= _WALL_FAR_M - _WALL_NEAR_M) & (cosine > _PARALLEL))

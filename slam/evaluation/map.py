@@ -249,18 +249,12 @@ def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) ->
         chosen = np.flatnonzero(doubled_area > 0)
         chosen = chosen[:: -(-len(chosen) // _MOST_RAYS) or 1]
         direction = normal[chosen] / doubled_area[chosen, None]
-        is_double = _has_parallel_before(vertices, triangles, corners[chosen].mean(axis=1), direction)
+        rays = np.concatenate([corners[chosen].mean(axis=1) + _WALL_NEAR_M * direction, direction], axis=1)
+        scene = scene_of(vertices.astype(np.float32), triangles.astype(np.uint32))
+        answer = scene.cast_rays(import_open3d().core.Tensor(rays.astype(np.float32)))
+        cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)
+        is_double = (answer["t_hit"].numpy() <= _WALL_FAR_M - _WALL_NEAR_M) & (cosine > _PARALLEL)
         weight = doubled_area.sum() / max(doubled_area[chosen].sum(), np.finfo(float).tiny)
         found += weight * float(doubled_area[chosen][is_double].sum())
         total += float(doubled_area.sum())
     return found / total if total > 0 else float("nan")
-
-
-def _has_parallel_before(
-    vertices: FloatArray, triangles: NDArray[np.int64], points: FloatArray, direction: FloatArray
-) -> NDArray[np.bool_]:
-    scene = scene_of(vertices.astype(np.float32), triangles.astype(np.uint32))
-    rays = np.concatenate([points + _WALL_NEAR_M * direction, direction], axis=1).astype(np.float32)
-    answer = scene.cast_rays(import_open3d().core.Tensor(rays))
-    cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)
-    return np.asarray((answer["t_hit"].numpy() <= _WALL_FAR_M - _WALL_NEAR_M) & (cosine > _PARALLEL))

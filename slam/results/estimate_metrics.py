@@ -108,11 +108,11 @@ def _stretches(reasons: Mapping[int, str]) -> list[records.Stretch]:
 
 def _lidar_metrics(result: Estimate) -> TrajectoryMetrics | Failed:
     """Errors of LiDAR odometry at its frames."""
-    path, lidar = result.lidar, lidar_trajectory(result)
-    if not isinstance(path, LidarPath) or lidar is None:
+    path = result.lidar
+    if not isinstance(path, LidarPath):
         return path or Failed("the sequence has no LiDAR scans")
     reference = None if result.reference is None else result.reference.select(path.frames).rebased()
-    return trajectory_metrics(lidar, reference)
+    return trajectory_metrics(Trajectory(result.optimised.stamps[path.frames], path.T_world_camera), reference)
 
 
 def _network_snippets(result: Estimate) -> SnippetErrors | None:

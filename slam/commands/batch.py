@@ -30,8 +30,8 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.results.tables import written
 from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.runtime.files import from_anywhere, source_from_anywhere, write_atomically
 from slam.runtime.imports import import_extra
-from slam.runtime.storage.files import from_anywhere, source_from_anywhere, write_atomically
 from slam.sequences.catalogue import sequence_kinds
 from slam.sequences.recording import frame_range
 

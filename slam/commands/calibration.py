@@ -23,7 +23,7 @@ from erfsfm.common.readers.video import VideoFrames
 from slam.frames import Grey
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SlamError, sequence_errors
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.images import ImageFiles, ImageSource
 from slam.sequences.undistortion import Undistortion

@@ -405,7 +405,7 @@ def _print_run(folder: RunFolder) -> None:
     from slam.results.report.tables import by_reason
     from slam.results.report.verdict import verdict
     from slam.results.tables import errors_table, written
-    from slam.runtime.run_files import REPORT
+    from slam.runtime.files import REPORT
 
     metrics = folder.metrics()
     sequence, provenance, timing = metrics.sequence, metrics.provenance, metrics.timing

@@ -29,8 +29,7 @@ from slam.results.tables import (
     written,
 )
 from slam.runtime.errors import RunError, SlamError, TrajectoryError
-from slam.runtime.run_files import REFERENCE, trajectory_file
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import REFERENCE, trajectory_file, write_atomically
 from slam.sequences.recording import frame_range
 
 logger = logging.getLogger(__name__)

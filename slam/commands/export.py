@@ -28,8 +28,7 @@ from slam.loops.verification import OF_KEYFRAMES
 from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES, write_atomically
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 

@@ -17,7 +17,7 @@ from slam.formats.ply import Ply
 from slam.geometry.se3 import FloatArray
 from slam.mapping.views import moved_rows
 from slam.runtime.errors import RunError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 _THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}

@@ -42,9 +42,18 @@ from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog, run_log
 from slam.results.truth import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
+from slam.runtime.files import (
+    CONFIG,
+    GRAPH,
+    LOG,
+    LOOPS,
+    MAP_CLOUD,
+    MAP_MESH,
+    PLACES,
+    from_anywhere,
+    source_from_anywhere,
+)
 from slam.runtime.imports import import_extra
-from slam.runtime.run_files import CONFIG, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
-from slam.runtime.storage.files import from_anywhere, source_from_anywhere
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.gps import read_gps
 

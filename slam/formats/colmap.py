@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import RunError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 HEADER = "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY"  # not in COLMAP's words
 _HEADERS = {

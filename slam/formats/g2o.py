@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import RelativePose
 from slam.geometry.se3 import FloatArray
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UPPER = np.triu_indices(6)  # row by row

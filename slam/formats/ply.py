@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 _TYPES = {"double": "f8", "float": "f4", "uchar": "u1", "int": "i4", "uint": "u4"}  # that Open3D and we write
 _NAMES = {kind: name for name, kind in _TYPES.items()}

@@ -19,7 +19,7 @@ from slam.formats.rows import BadRows, in_seconds, is_number, rows_of
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 logger = logging.getLogger(__name__)
 

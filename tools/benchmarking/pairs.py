@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 
 from erfsfm.common.table import Table
-from slam.runtime.run_files import METRICS
+from slam.runtime.files import METRICS
 
 Cost = dict[str, float]  # of a run, by column
 Costs = dict[str, dict[str, Cost]]  # medians by drive and checkout

@@ -21,7 +21,7 @@ from slam.commands.batch import Drive, run_drives
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
-from slam.runtime.run_files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
+from slam.runtime.files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
 from slam.sequences.catalogue import sequence_kinds
 from slam.simulation.hazards import Hazard
 from slam.simulation.options import VERSION

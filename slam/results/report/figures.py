@@ -16,7 +16,7 @@ from slam.formats.trajectory import Trajectory, associate
 from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
 from slam.results.metrics import AcceptedLoop, Stretch
 from slam.results.report.map_view import MapView
-from slam.runtime.run_files import REFERENCE
+from slam.runtime.files import REFERENCE
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito (2008): for every eye
 LOOKS: dict[str, tuple[str, str | None, float, str]] = {  # label, colour (None: that of text), width, dash

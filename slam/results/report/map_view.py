@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
+from slam.runtime.files import MAP_MESH
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import MAP_MESH
 
 _TRIANGLES = 60_000  # that a browser turns smoothly, in a page of 3 to 6 MB
 _COARSER = 1.15  # vertices of one surface do not all meet in its cells

@@ -22,7 +22,7 @@ from slam.loops.descriptors import FeatureExtractor
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
-from slam.runtime.run_files import PLACES
+from slam.runtime.files import PLACES
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

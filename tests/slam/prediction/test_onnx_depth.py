@@ -98,6 +98,14 @@ def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: Mak
         opened(path, size=(14, 28))
 
 
+def test_the_size_is_that_of_the_file_or_is_set(make_network: MakeNetwork) -> None:
+    with pytest.raises(SlamError, match=r"any size: set depth\.size=\[HEIGHT,WIDTH\]"):
+        opened(make_network(shape=(1, 3, "height", "width")))
+    assert opened(make_network(), size=(16, 32)).disparity(Frame(0, 0.0, image())).shape == (16, 32)
+    with pytest.raises(SlamError, match=r"height and width \[16, 32\], not \[14, 28\]: leave depth\.size out"):
+        opened(make_network(), size=(14, 28))
+
+
 def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path) -> None:
     model = onnx.load(make_network())
     for tensor in model.graph.initializer:

@@ -184,7 +184,7 @@ class FolderRecorder(Recorder):
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
         sizes = estimate.map.statistics()
-        found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
+        found = MapMetrics.of(**sizes, double_wall_share=share, **errors)
         self._metrics = self._metrics.changed(map=found)
 
     def _surface(self, estimate: Estimate | Failed) -> MapSurface | Failed:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slam.evaluation.depth import DepthErrors
-from slam.evaluation.map import ERRORS, OUTLIER_M, PlacedMetrics, compare, placed_metrics, pose_similarity
+from slam.evaluation.map import ERRORS, OUTLIER_M, PlacedMetrics, compare, placed_errors, pose_similarity
 from slam.evaluation.surface import RANGE_M, Indices, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import DepthMap, Intrinsics, Mask, Sequence
 from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.estimate import Estimate
-from slam.results.metrics import DepthOfKeyframes, MapMetrics
+from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.errors import Failed, SlamError
 from slam.sequences.recording import RecordedSequence
 from slam.sequences.simulated import SimulatedSequence
@@ -111,15 +112,15 @@ def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
 
 
-def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> MapMetrics:
-    """Errors of a map moved to the truth by one rigid motion, and under ``with_scale`` by a similarity.
+def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> dict[str, Any]:
+    """Values of `MapMetrics`: errors of a map moved to the truth rigidly, and under ``with_scale`` by a similarity.
 
     ``pieces`` iterates over the points of the map, ``(P, 3)`` each; of a long drive only those near the stretches that
     are looked at are held.
     """
     truth = find_truth(sequence)
     if isinstance(truth, str):
-        return MapMetrics.unknown(truth, *_MAP_ERRORS)
+        return dict.fromkeys(_MAP_ERRORS, Failed(truth))
     assert sequence.reference is not None
     poses = result.optimised.T_world_camera
     fits = {"with_scale": pose_similarity(sequence.reference, poses)}
@@ -132,14 +133,13 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
         distances, length_m = compare(truth, sequence.reference, placed)
     except SlamError as error:
         logger.warning("the error of the map is not known: %s", error)
-        return MapMetrics.unknown(str(error), *_MAP_ERRORS)
+        return dict.fromkeys(_MAP_ERRORS, Failed(str(error)))
     if truth.distance is None and len(distances["with_scale"].to_map) == 0:
-        return MapMetrics.unknown("no point of the true surface is known near the images", *_MAP_ERRORS)
-    with_scale = placed_metrics(PlacedMetrics, distances["with_scale"], scale=fits["with_scale"].scale)
-    more = {"truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
-    if "rigid" not in fits:
-        return MapMetrics.of(**dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale")), **more)
-    return placed_metrics(MapMetrics, distances["rigid"], **more)
+        return dict.fromkeys(_MAP_ERRORS, Failed("no point of the true surface is known near the images"))
+    no_metres = dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale"))
+    errors = placed_errors(distances["rigid"]) if "rigid" in fits else no_metres
+    with_scale = PlacedMetrics.of(**placed_errors(distances["with_scale"]), scale=fits["with_scale"].scale)
+    return {**errors, "truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
 
 
 def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> FloatArray:

@@ -29,8 +29,8 @@ from slam.results.folder import RunFolder
 from slam.results.report.figures import LOOKS
 from slam.results.report.map_view import MapMesh, thinned_mesh
 from slam.results.report.pictures import narrowed
+from slam.runtime.files import MAP_MESH, REFERENCE, TRAJECTORIES
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import MAP_MESH, REFERENCE, TRAJECTORIES
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600

@@ -30,9 +30,9 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.results.tables import written
 from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.runtime.files import from_anywhere, source_from_anywhere, write_atomically
 from slam.runtime.imports import import_extra
-from slam.runtime.storage.files import from_anywhere, write_atomically
-from slam.sequences.catalogue import sequence_names
+from slam.sequences.catalogue import sequence_kinds
 from slam.sequences.recording import frame_range
 
 CSV = "drives.csv"
@@ -92,9 +92,8 @@ def options_of_drives(
     frame_range(frames or ":", EVERYTHING)
     words = []
     for override in overrides:
-        kind, colon, path = override.partition(":")
-        is_path = kind.startswith("depth.source=") and bool(colon)
-        words += ["--set", f"{kind}:{from_anywhere(path)}" if is_path else override]
+        key, equals, value = override.partition("=")
+        words += ["--set", key + equals + (source_from_anywhere(value) if key == "depth.source" else value)]
     if weights is not None:
         words += ["--weights", from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights]
     if config is not None:
@@ -153,8 +152,7 @@ def run_drives(
         outcomes[number] = result
         progress("drives", len(outcomes), len(drives))
     ordered = [outcomes[number] for number in range(len(drives))]
-    content = csv_of(map(_row, ordered))
-    write_atomically(output / CSV, lambda path: path.write_text(content, encoding="utf-8", newline=""), RunError)
+    write_atomically(output / CSV, csv_of(map(_row, ordered)), RunError)
     return ordered
 
 
@@ -227,7 +225,7 @@ def summary_table(outcomes: Sequence[Outcome]) -> Table:
 
 
 def _of_data_set(root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
-    names = sequence_names(root)
+    names = list(sequence_kinds(root))
     if not names:
         raise SequenceError(f"{root} is no manifest ({_MANIFEST}) and holds no sequences")
     missing = [name for name in sequences if name != "all" and name not in names]

@@ -330,8 +330,7 @@ def calibrate(
 
     Example: erfsfm-slam calibrate board.mp4 --board 9x6 --square-m 0.03 --output camera.yaml
     """
-    from slam.commands.board import Board, parse_board
-    from slam.commands.calibration import calibrate_camera
+    from slam.commands.calibration import Board, calibrate_camera, parse_board
 
     wanted = Board(*parse_board(board), square_m, pattern, dictionary, marker_share)
     with progress_bar() as progress:
@@ -406,7 +405,7 @@ def _print_run(folder: RunFolder) -> None:
     from slam.results.report.tables import by_reason
     from slam.results.report.verdict import verdict
     from slam.results.tables import errors_table, written
-    from slam.runtime.run_files import REPORT
+    from slam.runtime.files import REPORT
 
     metrics = folder.metrics()
     sequence, provenance, timing = metrics.sequence, metrics.provenance, metrics.timing

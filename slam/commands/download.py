@@ -13,8 +13,8 @@ from typing import Any
 
 from erfsfm.common.progress import Progress
 from slam.runtime.errors import SlamError
+from slam.runtime.files import write_atomically
 from slam.runtime.imports import import_extra
-from slam.runtime.storage.files import write_atomically
 
 LICENCE = """KITTI odometry: A. Geiger, P. Lenz, C. Stiller, R. Urtasun; Karlsruhe Institute of Technology and Toyota
 Technological Institute at Chicago. Licence: Creative Commons Attribution-NonCommercial-ShareAlike 3.0

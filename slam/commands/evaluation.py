@@ -29,8 +29,7 @@ from slam.results.tables import (
     written,
 )
 from slam.runtime.errors import RunError, SlamError, TrajectoryError
-from slam.runtime.run_files import REFERENCE, trajectory_file
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import REFERENCE, trajectory_file, write_atomically
 from slam.sequences.recording import frame_range
 
 logger = logging.getLogger(__name__)
@@ -50,8 +49,7 @@ def against_reference(
         check_replaced(csv, b"system,path")
     runs = compare(named_paths(paths), reference, format, frames)
     if csv is not None:
-        content = csv_of(dict(_flat(run.tree())) for run in runs)
-        write_atomically(csv, lambda partial: partial.write_text(content, encoding="utf-8", newline=""), RunError)
+        write_atomically(csv, csv_of(dict(_flat(run.tree())) for run in runs), RunError)
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:

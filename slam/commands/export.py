@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from erfsfm.common.files import refuse_foreign
 from erfsfm.common.progress import Progress, silent
 from slam.commands.occupancy import occupancy_grid, write_ros_map
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
-from slam.formats.ply import Ply, read_ply, rotated, write_ply
+from slam.formats.ply import R_UP_WORLD, Ply, read_ply, rotated, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
 from slam.frames import Intrinsics, Sequence
 from slam.geometry import se3
@@ -29,18 +28,13 @@ from slam.loops.verification import OF_KEYFRAMES
 from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES, write_atomically
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 
 logger = logging.getLogger(__name__)
 
-# from a camera's x right, y down, z ahead
-R_UP_WORLDS = {
-    "y-down": np.eye(3),
-    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # x right, y ahead, z up
-}
+R_UP_WORLDS = {"y-down": np.eye(3), "z": R_UP_WORLD}  # from a camera's x right, y down, z ahead
 POINTS, TRANSFORMS = "points.ply", "transforms.json"
 _IMAGES = "images"
 _MADE_BY = {"made_by": "erfsfm-slam"}
@@ -217,7 +211,7 @@ def _write_scene(
     poses = {k: (trajectory.T_world_camera[k] @ _T_CAMERA_OPENGL).tolist() for k in frames}
     scene["frames"] = [{"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()]
     text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
-    write_atomically(output / TRANSFORMS, lambda file: file.write_text(text, encoding="utf-8"), RunError)
+    write_atomically(output / TRANSFORMS, text, RunError)
 
 
 def _write_images(
@@ -235,7 +229,7 @@ def _write_images(
         except (SlamError, ErfsfmError):
             continue
         content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-        write_atomically(output / _image_name(k), partial(Path.write_bytes, data=content), RunError)
+        write_atomically(output / _image_name(k), content, RunError)
         written.append(k)
     if not written:
         raise RunError(f"no image of {folder.path} can be read: check the data set")

@@ -106,7 +106,7 @@ class StreamedSequence(GrowingSequence):
         waiting: stamps, images, and when they came.
         arrived_s: when the last frames came, by frame, by the monotonic clock.
         dropped: number of images that waited, and were too old when another one came.
-        ended: why there are no more, after the last one.
+        ended: why there are no more after those that wait; empty while more may come.
     """
 
     def __init__(
@@ -125,7 +125,6 @@ class StreamedSequence(GrowingSequence):
         self.dropped, self.ended = 0, ""
         self._source, self._most_wait_s, self._every_frame = source, most_wait_s, every_frame
         self.waiting: deque[tuple[float, Image, float]] = deque()
-        self._reason: str | None = None
         self._changed, self._stopped = Condition(), Event()
         self._thread = Thread(target=self._read, name="reader", daemon=True)
 
@@ -153,11 +152,11 @@ class StreamedSequence(GrowingSequence):
 
     def _take(self) -> tuple[float, Image, float] | None:
         with self._changed:
-            self._changed.wait_for(lambda: self.waiting or self._reason is not None, self._most_wait_s)
+            self._changed.wait_for(lambda: self.waiting or self.ended, self._most_wait_s)
             taken = self.waiting.popleft() if self.waiting else None
             self._changed.notify()
             if taken is None:
-                self.ended = self._reason or f"nothing came for {self._most_wait_s:g} s"
+                self.ended = self.ended or f"nothing came for {self._most_wait_s:g} s"
                 self._stopped.set()
             return taken
 
@@ -180,7 +179,7 @@ class StreamedSequence(GrowingSequence):
 
     def _end(self, reason: str) -> None:
         with self._changed:
-            self._reason = self._reason or reason
+            self.ended = self.ended or reason
             self._changed.notify()
 
 

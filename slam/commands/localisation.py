@@ -28,7 +28,7 @@ from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
-from slam.runtime.run_files import PLACES
+from slam.runtime.files import PLACES
 from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.recording import frame_range

@@ -17,7 +17,7 @@ from slam.formats.ply import Ply
 from slam.geometry.se3 import FloatArray
 from slam.mapping.views import moved_rows
 from slam.runtime.errors import RunError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 _THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}
@@ -193,12 +193,10 @@ def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: FloatArray, reso
     ``map_server`` takes lengths for metres, whatever their ``unit`` is: a comment says so.
     """
     image = path.with_suffix(".pgm")
-    content = cv2.imencode(".pgm", cells)[1].tobytes()
-    write_atomically(image, lambda partial: partial.write_bytes(content), RunError)
+    write_atomically(image, cv2.imencode(".pgm", cells)[1].tobytes(), RunError)
     description = {"image": image.name, "resolution": resolution, "origin": [*corner.tolist(), 0.0], "negate": 0}
     text = yaml.safe_dump(description | _THRESHOLDS, sort_keys=False, default_flow_style=None)
-    text = f"# lengths in {unit}\n{text}"
-    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), RunError)
+    write_atomically(path, f"# lengths in {unit}\n{text}", RunError)
 
 
 def _plane(points: FloatArray, start: FloatArray, tilt: FloatArray, height: float) -> tuple[FloatArray, FloatArray]:

@@ -42,9 +42,18 @@ from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog, run_log
 from slam.results.truth import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
+from slam.runtime.files import (
+    CONFIG,
+    GRAPH,
+    LOG,
+    LOOPS,
+    MAP_CLOUD,
+    MAP_MESH,
+    PLACES,
+    from_anywhere,
+    source_from_anywhere,
+)
 from slam.runtime.imports import import_extra
-from slam.runtime.run_files import CONFIG, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES
-from slam.runtime.storage.files import from_anywhere
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.gps import read_gps
 
@@ -124,11 +133,9 @@ class FolderRecorder(Recorder):
     def begin(self) -> None:
         """The metrics and settings of a run that begins; the source of depth by its whole path."""
         self.folder.write_metrics(self._metrics)
-        settings, (kind, colon, path) = self._settings, self._settings.depth.source.partition(":")
-        if colon:
-            depth = settings.depth.model_copy(update={"source": f"{kind}:{from_anywhere(path)}"})
-            settings = settings.model_copy(update={"depth": depth})
-        self.folder.write_text(CONFIG, dump_yaml(settings))
+        depth = self._settings.depth
+        depth = depth.model_copy(update={"source": source_from_anywhere(depth.source)})
+        self.folder.write(CONFIG, dump_yaml(self._settings.model_copy(update={"depth": depth})))
 
     def trajectory(self, name: str, trajectory: Trajectory) -> None:
         """On disk in both formats."""
@@ -144,7 +151,7 @@ class FolderRecorder(Recorder):
             folder.write_trajectory("lidar", lidar)
         if not isinstance(estimate.graph, Failed):
             estimate.graph.write_g2o(folder.path / GRAPH)
-        folder.write_text(LOOPS, json.dumps(estimate.loops.details(), indent=2, allow_nan=False))
+        folder.write(LOOPS, json.dumps(estimate.loops.details(), indent=2, allow_nan=False))
         folder.write(PLACES, estimate.places(sequence.intrinsics).write)
         with estimate.stopwatch.stage("evaluation"):
             self._metrics = estimate_metrics(estimate, sequence, self._provenance, self._settings.gps.factors)
@@ -177,7 +184,7 @@ class FolderRecorder(Recorder):
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
         sizes = estimate.map.statistics()
-        found = MapMetrics.of(**sizes, double_wall_share=share, **errors.tree())
+        found = MapMetrics.of(**sizes, double_wall_share=share, **errors)
         self._metrics = self._metrics.changed(map=found)
 
     def _surface(self, estimate: Estimate | Failed) -> MapSurface | Failed:
@@ -196,15 +203,14 @@ class FolderRecorder(Recorder):
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""
-        sequence, output = self.pipeline.sequence, self._settings.output
         depth = self._quality.metrics(self._settings.depth.refine != "none")
-        timing = timing_of(self._stopwatch, len(sequence))
+        timing = timing_of(self._stopwatch, len(self.pipeline.sequence))
         metrics = self._metrics.changed(status="ok", reason=None, timing=timing, depth=depth)
 
         def reported() -> None:
-            if output.report:
-                view = map_view(self.folder, output.viewer_triangles)
-                write_report(self.folder, self._depths.pictures(), self._loop_pictures(estimate), view, metrics)
+            if self._settings.output.report:
+                pictures = self._depths.pictures(), self._loop_pictures(estimate)
+                write_report(self.folder, *pictures, map_view(self.folder), metrics)
 
         self._progress("report", 0, 1)
         attempt("the report", reported)

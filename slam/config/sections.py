@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import Field, PositiveFloat, field_validator, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, field_validator, model_validator
 
 import erfsfm.common.errors
 from erfsfm.common.config_tree import Section, dump_explained
@@ -54,8 +54,9 @@ class DepthConfig(Section):
     std: tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None = Field(
         default=None, description="onnx: standard deviation, by which RGB less the mean is divided; null likewise"
     )
-    height: int = Field(default=0, ge=0, description="onnx: height of the input; 0 if the file fixes it")
-    width: int = Field(default=0, ge=0, description="onnx: width of the input; 0 if the file fixes it")
+    size: tuple[PositiveInt, PositiveInt] | None = Field(
+        default=None, description="onnx: height and width of the input; null if the file fixes them"
+    )
     output_name: str = Field(default="", description="onnx: name of the output, if the network has several")
     png_scale: float = Field(
         default=256.0, gt=0, description="png: value of a pixel at a depth of 1 m; a pixel of 0 is unknown"
@@ -118,9 +119,6 @@ class GapsConfig(Section):
         default=True,
         description="interpolate over unusable frames; false: measure them like other frames, which may end the run",
     )
-    max_unread_frames: int = Field(
-        default=30, ge=1, description="largest number of consecutive unreadable images; more end the run"
-    )
 
 
 class LidarConfig(Section):
@@ -169,7 +167,6 @@ class LoopsConfig(Section):
     """Loop closure, see ``loops/closure.py``."""
 
     enabled: bool = Field(default=True, description="detect and close loops")
-    frame_stride: int = Field(default=4, ge=1, description="frames between those that are described and compared")
 
 
 class MappingConfig(Section):
@@ -178,9 +175,6 @@ class MappingConfig(Section):
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
     keyframe_distance_m: float = Field(default=1.5, ge=0, description="distance between keyframes, metres")
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel, metres")
-    truncation_voxels: float = Field(
-        default=10.0, ge=1, description="truncation distance of the signed distance, voxels"
-    )
     depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth, metres")
     depth_max_m: float = Field(
         default=20.0, gt=0, description="largest fused depth, metres; up to 1.4 times that where it is certain"
@@ -191,7 +185,6 @@ class MappingConfig(Section):
         lt=1,
         description="height of the lower part with the car's own hood that is left out, over the image's height",
     )
-    max_relative_sigma: float = Field(default=0.3, gt=0, description="largest sigma of fused depth, over the depth")
     close_holes_m: float = Field(
         default=1.5, ge=0, description="largest diameter of a hole of the road that is closed, metres"
     )
@@ -221,9 +214,6 @@ class OutputConfig(Section):
 
     root: str = Field(default="results", min_length=1, description="parent folder of run folders")
     report: bool = Field(default=True, description="write report.html")
-    viewer_triangles: int = Field(
-        default=60_000, ge=0, description="largest number of triangles of the map in the report; 0: no map in it"
-    )
 
 
 class SlamConfig(Section):

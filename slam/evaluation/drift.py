@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.runtime.run_files import REFERENCE
+from slam.runtime.files import REFERENCE
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 FIGURE_LENGTHS_M = (10.0, 20.0, 50.0, *KITTI_LENGTHS_M)

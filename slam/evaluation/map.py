@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from slam.mapping.views import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part
+from slam.simulation.surface import scene_of
 
 NEAR_CAMERA_M = 20.0
 COVERED_WITHIN_M = 0.3
@@ -152,42 +153,37 @@ def compare(
     return together, float(sum(to_next[part].sum() for part in parts))
 
 
-_Kind = TypeVar("_Kind", bound=SurfaceMetrics)
-_Placed = TypeVar("_Placed", bound=PlacedMetrics)
-
-
-def placed_metrics(kind: type[_Placed], distances: MapDistances, **more: Any) -> _Placed:
-    """All errors of a placed map, also by distance from the nearest camera, with ``more`` values of their record."""
+def placed_errors(distances: MapDistances) -> dict[str, Any]:
+    """`ERRORS` of a placed map, also by distance from the nearest camera."""
     own, true = distances.to_surface, distances.to_map
     in_field, near = distances.in_field, distances.surface_range < NEAR_CAMERA_M
     curve = []
     for from_m, to_m in BINS_M:
         of_map = (distances.map_range >= from_m) & (distances.map_range < to_m)
         of_surface = (distances.surface_range >= from_m) & (distances.surface_range < to_m)
+        ring = _errors(own[of_map], true[of_surface], _LEAST_IN_BIN)
         counts = {"map_points": int(of_map.sum()), "surface_points": int(of_surface.sum())}
-        ring: dict[str, Any] = {"from_m": from_m, "to_m": to_m, **counts}
-        curve.append(_metrics(SurfaceMetrics, own[of_map], true[of_surface], _LEAST_IN_BIN, **ring))
+        curve.append(SurfaceMetrics.of(from_m=from_m, to_m=to_m, **ring, **counts))
     share = _share(in_field) if len(in_field) else _NO_MAP
-    fair = _metrics(SurfaceMetrics, own[in_field], true[near], 1, share=share)
-    return _metrics(kind, own, true[near], 1, in_field=fair, by_distance=curve, **more)
+    fair = SurfaceMetrics.of(**_errors(own[in_field], true[near], 1), share=share)
+    return _errors(own, true[near], 1) | {"in_field": fair, "by_distance": curve}
 
 
-def _metrics(kind: type[_Kind], own: FloatArray, true: FloatArray, least: int, **more: Any) -> _Kind:
+def _errors(own: FloatArray, true: FloatArray, least: int) -> dict[str, Any]:
     """Accuracy, completeness and F-scores of distances from the map and to it, missing below ``least`` points."""
     no_map = (_NO_MAP if least == 1 else _FEW) if len(own) < least else None
     no_surface = (_NO_SURFACE if least == 1 else _FEW) if len(true) < least else None
     precision = {key: no_map or _share(own <= within) for key, within in F_SCORES_M.items()}
     recall = {key: no_surface or _share(true <= within) for key, within in F_SCORES_M.items()}
-    return kind.of(
-        accuracy_median_m=no_map or float(np.median(own)),
-        accuracy_90_m=no_map or float(np.quantile(own, 0.9)),
-        outlier_share=no_map or _share(own > OUTLIER_M),
-        completeness=no_surface or _share(true <= COVERED_WITHIN_M),
-        f_score=Within.of(**{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}),
-        precision=Within.of(**precision),
-        recall=Within.of(**recall),
-        **more,
-    )
+    return {
+        "accuracy_median_m": no_map or float(np.median(own)),
+        "accuracy_90_m": no_map or float(np.quantile(own, 0.9)),
+        "outlier_share": no_map or _share(own > OUTLIER_M),
+        "completeness": no_surface or _share(true <= COVERED_WITHIN_M),
+        "f_score": Within.of(**{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}),
+        "precision": Within.of(**precision),
+        "recall": Within.of(**recall),
+    }
 
 
 def _share(which: Mask) -> float:
@@ -248,20 +244,12 @@ def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) ->
         chosen = np.flatnonzero(doubled_area > 0)
         chosen = chosen[:: -(-len(chosen) // _MOST_RAYS) or 1]
         direction = normal[chosen] / doubled_area[chosen, None]
-        is_double = _has_parallel_before(vertices, triangles, corners[chosen].mean(axis=1), direction)
+        rays = np.concatenate([corners[chosen].mean(axis=1) + _WALL_NEAR_M * direction, direction], axis=1)
+        scene = scene_of(vertices.astype(np.float32), triangles.astype(np.uint32))
+        answer = scene.cast_rays(import_open3d().core.Tensor(rays.astype(np.float32)))
+        cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)
+        is_double = (answer["t_hit"].numpy() <= _WALL_FAR_M - _WALL_NEAR_M) & (cosine > _PARALLEL)
         weight = doubled_area.sum() / max(doubled_area[chosen].sum(), np.finfo(float).tiny)
         found += weight * float(doubled_area[chosen][is_double].sum())
         total += float(doubled_area.sum())
     return found / total if total > 0 else float("nan")
-
-
-def _has_parallel_before(
-    vertices: FloatArray, triangles: NDArray[np.int64], points: FloatArray, direction: FloatArray
-) -> NDArray[np.bool_]:
-    o3d = import_open3d()
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
-    rays = np.concatenate([points + _WALL_NEAR_M * direction, direction], axis=1).astype(np.float32)
-    answer = scene.cast_rays(o3d.core.Tensor(rays))
-    cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)
-    return np.asarray((answer["t_hit"].numpy() <= _WALL_FAR_M - _WALL_NEAR_M) & (cosine > _PARALLEL))

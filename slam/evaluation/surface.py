@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slam.frames import Mask
-from slam.geometry.se3 import FloatArray, path_distance
+from slam.geometry.se3 import FloatArray, apply, path_distance
 
 RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
 STRETCH_M = 100.0
@@ -38,22 +37,21 @@ class Surface:
     in_image: Mask
 
 
-class SurfaceTruth(Protocol):
+@dataclass(frozen=True)
+class SurfaceTruth:
     """A source of the true surface; its world is that of the true poses.
 
-    ``name`` says what it is, ``frames`` ``(F,)`` which frames measured the surface. ``distance``, where the surface is
-    known exactly, gives the distances ``(P,)`` of points ``(P, 3)`` to it.
+    ``name`` says what it is, ``frames`` ``(F,)`` which frames measured the surface, ``view`` gives the surface as one
+    of them measured it. ``in_field`` says whether the sensor could have measured points ``(P, 3)`` from any of some
+    frames that were viewed, if nothing hid them. ``distance``, where the surface is known exactly, gives the distances
+    ``(P,)`` of points ``(P, 3)`` to it.
     """
 
     name: str
     frames: Indices
-    distance: Callable[[FloatArray], FloatArray] | None
-
-    def view(self, frame: int) -> Surface:
-        """The surface as one frame measured it."""
-
-    def in_field(self, points: FloatArray, frames: Indices) -> Mask:
-        """Whether the sensor could have measured points ``(P, 3)`` from any of these frames, if nothing hid them."""
+    view: Callable[[int], Surface]
+    in_field: Callable[[FloatArray, Indices], Mask]
+    distance: Callable[[FloatArray], FloatArray] | None = None
 
 
 def thinned(points: FloatArray, voxel_m: float, order: Indices) -> Indices:
@@ -120,5 +118,4 @@ def backprojected(depth_m: FloatArray, rays: FloatArray, T_world_camera: FloatAr
     known = np.isfinite(depth_m) & (depth_m > 0)
     points = rays[known] * depth_m[known][:, None]
     near = points[np.linalg.norm(points, axis=1) <= range_m]
-    points_world: FloatArray = near @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    return points_world
+    return apply(T_world_camera, near)

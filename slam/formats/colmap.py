@@ -6,7 +6,7 @@ COLMAP writes ``T_camera_world``, quaternions wxyz, and puts (0.5, 0.5) at the c
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import RunError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 HEADER = "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY"  # not in COLMAP's words
 _HEADERS = {
@@ -78,22 +78,15 @@ def write_colmap(
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx + _HALF_PIXEL, intrinsics.cy + _HALF_PIXEL
     pinhole = [float(value) for value in (fx, fy, cx, cy)]
     camera = [f"1 PINHOLE {width} {height} {' '.join(map(repr, pinhole))}"]
-    packed = [struct.pack("<IiQQ4d", 1, _PINHOLE, width, height, *pinhole)]
+    packed_camera = [struct.pack("<IiQQ4d", 1, _PINHOLE, width, height, *pinhole)]
     images, packed_images = _images(T_world_camera, without_image, sightings, of_frames)
     points, packed_points = _points(points_world, colours, sightings, of_frames)
     counts = 1, len(images) // 2, len(points)
-    lines, parts = (camera, images, points), (packed, packed_images, packed_points)
+    lines, parts = (camera, images, points), (packed_camera, packed_images, packed_points)
     for name, count, text, binary in zip(MODEL_FILES, counts, lines, parts, strict=True):
-        _write(folder / BINARY_FOLDER / "0" / Path(name).with_suffix(".bin"), [struct.pack("<Q", count), *binary])
-        _write(folder / name, (f"{line}\n".encode("ascii") for line in (_HEADERS[name], *text)))
-
-
-def _write(path: Path, parts: Iterable[bytes]) -> None:
-    def fill(partial: Path) -> None:
-        with partial.open("wb") as file:
-            file.writelines(parts)
-
-    write_atomically(path, fill, RunError)
+        packed = struct.pack("<Q", count) + b"".join(binary)
+        write_atomically(folder / BINARY_FOLDER / "0" / Path(name).with_suffix(".bin"), packed, RunError)
+        write_atomically(folder / name, "\n".join([_HEADERS[name], *text, ""]), RunError)
 
 
 def _images(

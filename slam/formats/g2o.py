@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import RelativePose
 from slam.geometry.se3 import FloatArray
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UPPER = np.triu_indices(6)  # row by row
@@ -24,8 +24,7 @@ def write_g2o(path: Path, relative_poses: Sequence[RelativePose], T_world_camera
     for edge, pose in zip(relative_poses, _g2o_poses(T_from_to), strict=True):
         information = np.diag(1.0 / edge.graph_sigmas[_TRANSLATION_FIRST] ** 2)[_UPPER]
         lines.append(f"{_EDGE} {edge.from_index} {edge.to_index} {_numbers(pose)} {_numbers(information)}")
-    text = "\n".join(lines) + "\n"
-    write_atomically(path, lambda file: file.write_text(text, encoding="ascii"))
+    write_atomically(path, "\n".join([*lines, ""]))
 
 
 def _g2o_poses(T_a_b: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from slam.formats.rows import BadRows, in_seconds, is_number, rows_of
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -155,7 +155,8 @@ def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
     """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically; after its number where it has one."""
     rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
     numbers = [f"{stamp:.0f} " if trajectory.numbered else "" for stamp in trajectory.stamps]
-    _write(path, [number + _row(row) for number, row in zip(numbers, rows)])
+    lines = (f"{number}{_row(row)}\n" for number, row in zip(numbers, rows))
+    write_atomically(Path(path), "".join(lines), TrajectoryError)
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
@@ -163,8 +164,8 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
     poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
     stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
-    rows = [f"{stamp} {_row(pose)}" for stamp, pose in zip(stamps, poses)]
-    _write(path, ["# timestamp tx ty tz qx qy qz qw", *rows])
+    lines = (f"{stamp} {_row(pose)}\n" for stamp, pose in zip(stamps, poses))
+    write_atomically(Path(path), "".join(["# timestamp tx ty tz qx qy qz qw\n", *lines]), TrajectoryError)
 
 
 def associate(
@@ -323,8 +324,3 @@ def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:
 
 def _row(values: FloatArray) -> str:
     return " ".join(f"{value:.9e}" for value in values)
-
-
-def _write(path: Path | str, rows: list[str]) -> None:
-    text = "\n".join([*rows, ""])
-    write_atomically(Path(path), lambda partial: partial.write_text(text, encoding="utf-8"), TrajectoryError)

@@ -24,6 +24,7 @@ _MAX_DEPTH_DIFFERENCE = 0.1  # relative, to the depth of a neighbouring keyframe
 _OUTSIDE = -9.0  # a column left of every image
 _DARK_BLUE = 110  # grey levels below which nothing is the sky by day
 _MOST_SIGMA = 1e3  # relative, in place of infinity where depth is unknown
+MOST_RELATIVE_SIGMA = 0.3  # of fused depth, over it: beyond that a network guesses, as where a camera turns on the spot
 _EXACT = 0.01  # relative sigma below which depth is not a network's: border, sky and edges are not in doubt
 _BEHIND = 1.2  # depth that an earlier view sees over that of a thing which was not there yet
 _PIECE = np.ones((5, 5), np.uint8)  # pixels of the least such thing: at edges, depth is blurred
@@ -89,7 +90,7 @@ class DepthFilters:
             self._above_hood,
             ~self._is_sky(view.image) | is_exact,
             (depth >= config.depth_min_m) & (depth < farthest),
-            everything if view.relative_sigma is None else sigma <= config.max_relative_sigma,
+            everything if view.relative_sigma is None else sigma <= MOST_RELATIVE_SIGMA,
             ~_at_edges(self.trusted(view), _MAX_DEPTH_STEP) | is_exact,
             np.any([self._agrees(view, other) for other in others], axis=0) if others else everything,
             everything if earlier is None else ~self._is_seen_through(view, earlier),
@@ -106,7 +107,7 @@ class DepthFilters:
         """Depth with 0 where its sigma is too large."""
         if view.relative_sigma is None:
             return view.depth
-        return np.where(view.relative_sigma <= self._config.max_relative_sigma, view.depth, np.float32(0))
+        return np.where(view.relative_sigma <= MOST_RELATIVE_SIGMA, view.depth, np.float32(0))
 
     def projected(self, view: KeyframeDepth, other: KeyframeDepth) -> tuple[DepthMap, DepthMap, DepthMap]:
         """Columns, rows and depth ``(H, W)`` of a view's pixels in the other; unknown ones lie outside of it."""

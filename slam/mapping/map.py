@@ -14,7 +14,7 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply
 from slam.frames import Intrinsics
-from slam.mapping.filters import DepthFilters, KeyframeDepth
+from slam.mapping.filters import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
 from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
 from slam.mapping.views import ViewChooser
@@ -71,8 +71,8 @@ class TsdfMap:
         self._fuse_waiting(None)
         if self._left_out and not self._before:
             raise EmptyMapError(
-                f"the map is empty: none of {self._left_out} keyframes has depth that is certain to "
-                f"mapping.max_relative_sigma={self._config.max_relative_sigma:g}; more fuses what networks guess"
+                f"the map is empty: none of {self._left_out} keyframes has depth whose relative sigma is at most "
+                f"{MOST_RELATIVE_SIGMA:g}; more would be what networks guess"
             )
         if self._surface is None:
             self._finish_submap()
@@ -117,7 +117,7 @@ class TsdfMap:
         kept = self._filters.kept(view, others, next(iter(self._before), None))
         config = self._config
         if self._growing is None:
-            self._growing = Fusion(config.voxel_size_m, config.truncation_voxels, config.reach_m, self._intrinsics)
+            self._growing = Fusion(config.voxel_size_m, config.reach_m, self._intrinsics)
         if not self._growing.integrate(kept, view.T_world_camera):
             return
         self._views.add(view, kept)

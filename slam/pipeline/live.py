@@ -21,8 +21,8 @@ from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.prediction.assembly import open_prediction
 from slam.runtime.errors import Failed, SlamError
+from slam.runtime.files import MAP_MESH
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import MAP_MESH
 from slam.sequences.recording import POSSIBLE_PERIODS_S, GrowingSequence
 
 

@@ -34,6 +34,8 @@ logger = logging.getLogger(__name__)
 _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
 _LAST_ROADS = 8  # looked back for the camera's height, frames
+_MOST_UNREAD = 30  # unreadable images in a row: three seconds at 10 Hz, beyond which the motion cannot be guessed
+_LOOP_STRIDE = 4  # frames between views for loops: a car goes some 4 m, still the same place to a descriptor
 
 
 @dataclass
@@ -168,7 +170,7 @@ class Observer:
 
     def _is_gap(self, frames: int) -> bool:
         """Whether so many frames in a row may be without a measurement."""
-        return self._config.gaps.enabled and frames <= self._config.gaps.max_unread_frames
+        return self._config.gaps.enabled and frames <= _MOST_UNREAD
 
     def _leave_out(self, index: int, reason: str) -> None:
         try:
@@ -291,7 +293,7 @@ class Observer:
         self.keyframes.learn(frame, depth)
         current.depth, current.height = depth, height_of(road)
         views, loops = self.drive.views, self._config.loops
-        if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
+        if loops.enabled and (not views or frame.index - views[-1].index >= _LOOP_STRIDE):
             with self._stopwatch.stage("loops"):
                 view = self._features.view(frame, depth, current.height)
                 learned = view.points[:, 2].astype(np.float64)

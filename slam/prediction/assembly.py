@@ -8,9 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from erfsfm.inference import DepthPosePredictor, depth_at, limit_torch_threads
 from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
@@ -36,7 +33,10 @@ class NetworkPredictor:
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` at the image's size."""
         height, width = frame.image.shape[:2]
-        return depth_at(self._disparity(frame), height, width)
+        disparity = frame.derived(
+            (self._key, "disparity"), lambda: self._networks.disparity(self._prepared(frame))
+        )  # (h, w) of the networks
+        return depth_at(disparity, height, width)
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet; the target is the middle frame."""
@@ -44,9 +44,6 @@ class NetworkPredictor:
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
         return SnippetPoses(frames[middle].index, sources, T_source_target)
-
-    def _disparity(self, frame: Frame) -> NDArray[np.float32]:
-        return frame.derived((self._key, "disparity"), lambda: self._networks.disparity(self._prepared(frame)))
 
     def _prepared(self, frame: Frame) -> Any:
         return frame.derived((self._key, "prepared"), lambda: self._networks.prepare(frame.image))

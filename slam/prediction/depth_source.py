@@ -107,7 +107,8 @@ class SourcedPredictor:
         own, wanted = own[known], wanted[known]
         if len(own) < _LEAST_COMPARED:
             return np.full((height, width), np.nan, np.float32), np.nan
-        unit = _unit(own, wanted)
+        near = wanted >= np.median(wanted)  # the half whose depth both know best
+        unit = float(np.exp(np.median(np.log(wanted[near] / own[near]))))
         if self._align == "affine":
             gain, shift = _affine(own, wanted, unit)
             disparity = known_only(gain * disparity + shift)
@@ -144,12 +145,6 @@ def at_size(disparity: Disparity, height: int, width: int) -> Disparity:
         for part in (known, np.where(known, disparity, 0))
     )
     return np.where(weight >= least, total / np.maximum(weight, least), np.float32(np.nan)).astype(np.float32)
-
-
-def _unit(own: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
-    """Length of the networks' unit in the source's own: the median ratio of disparities of the nearer half."""
-    near = wanted >= np.median(wanted)
-    return float(np.exp(np.median(np.log(wanted[near] / own[near]))))
 
 
 def _affine(own: NDArray[np.float64], wanted: NDArray[np.float64], gain: float) -> tuple[np.float32, np.float32]:

@@ -142,16 +142,15 @@ class OnnxDepth:
                 f"{described}"
             )
         sides = shape[-2:] if channels_first else shape[-3:-1]
-        size = []
-        for name, fixed, given in zip(("height", "width"), sides, (config.height, config.width), strict=True):
-            if not isinstance(fixed, int) and not given:
-                raise SlamError(
-                    f"{self._path} takes images of any size: set depth.height and depth.width, such as those of its "
-                    "training"
-                )
-            if isinstance(fixed, int) and given not in (0, fixed):
-                raise SlamError(f"{self._path} takes images of {name} {fixed}, not {given}: leave depth.{name} out")
-            size.append(given or fixed)
+        size = config.size or sides
+        if not all(isinstance(side, int) for side in size):
+            raise SlamError(
+                f"{self._path} takes images of any size: set depth.size=[HEIGHT,WIDTH], such as that of its training"
+            )
+        if any(isinstance(fixed, int) and fixed != side for fixed, side in zip(sides, size, strict=True)):
+            raise SlamError(
+                f"{self._path} takes images of height and width {sides}, not {list(size)}: leave depth.size out"
+            )
         return inputs[0], shape, size[0], size[1]
 
     def _depth_output(self, config: DepthConfig) -> str:

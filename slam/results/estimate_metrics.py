@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
+from scipy.special import chdtri, fdtri
 
 from erfsfm.evaluation.pose_metrics import (
     SnippetErrors,
@@ -13,14 +15,15 @@ from erfsfm.evaluation.pose_metrics import (
     snippet_from_network,
     snippets_from_trajectory,
 )
-from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
-from slam.frames import Sequence, runs
+from slam.frames import RelativePose, runs
+from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive import DOUBLED
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import FloatArray, umeyama
+from slam.graph.pose_graph import whitened_squared
 from slam.loops.closure import MOST_REJECTED, LoopClosures
 from slam.pipeline.estimate import Estimate
 from slam.results import metrics as records
@@ -28,13 +31,14 @@ from slam.results.metrics import Metrics
 from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch, peak_rss_mb
 
+LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")
 _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
 _NO_MAP_YET = Failed("the run ended before its map was whole")
 
 
 def estimate_metrics(
-    result: Estimate, sequence: Sequence, provenance: records.Provenance, gps_in_graph: bool = True
+    result: Estimate, sequence: FrameSequence, provenance: records.Provenance, gps_in_graph: bool = True
 ) -> Metrics:
     """All metrics before the map is fused."""
     return Metrics.of(
@@ -83,7 +87,7 @@ def timing_of(watch: Stopwatch, frames: int) -> records.Timing:
     )
 
 
-def _sequence(result: Estimate, sequence: Sequence) -> records.SequenceMetrics:
+def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetrics:
     frames = len(sequence)
     span = float(sequence.stamps[-1] - sequence.stamps[0]) if frames > 1 else 0.0
     drive, reference = result.drive, result.reference
@@ -147,6 +151,45 @@ def _graph(result: Estimate) -> records.GraphMetrics:
     by_source = {source: records.CoverageMetrics.of(**shares) for source, shares in covered.items()}
     overall = by_source.pop("")
     return records.GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
+
+
+def coverage(
+    relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float
+) -> dict[str, dict[str, float]]:
+    """Ratio of factors whose error lies inside the 50, 90 and 95 % bound of their stated noise, ``{"50": 0.49, ...}``.
+
+    Under ``""`` of all of them, and by source, there with their number under ``factors``.
+
+    Args:
+        relative_poses: measurements with their noise, at least one.
+        T_world_camera_true: truth ``(N, 4, 4)``, metres.
+        scale: units of the measurements per metre, positive; scales the truth to them.
+    """
+    T_world_camera = T_world_camera_true.copy()
+    T_world_camera[:, :3, 3] *= scale
+    squared = whitened_squared(relative_poses, T_world_camera)
+    dofs, dof_of_factor = np.unique([edge.student_t_dof for edge in relative_poses], return_inverse=True)
+    inside = {}
+    for level in LEVELS:
+        bounds = np.array([squared_bound(level / 100, dof) for dof in dofs])
+        inside[str(level)] = squared <= bounds[dof_of_factor]  # (F,)
+    sources = np.array([edge.source for edge in relative_poses])
+    found = {"": {level: float(within.mean()) for level, within in inside.items()}}
+    for source in np.unique(sources):
+        ratios = {level: float(within[sources == source].mean()) for level, within in inside.items()}
+        found[str(source)] = {"factors": int((sources == source).sum()), **ratios}
+    return found
+
+
+def squared_bound(probability: float, student_t_dof: float) -> float:
+    """Quantile of the whitened squared error of six numbers.
+
+    For errors by Student's t with ``student_t_dof`` degrees of freedom, whose standard deviations are the sigmas: a
+    quantile of Fisher's F. For normal errors (infinite ``student_t_dof``): a quantile of chi-square.
+    """
+    if math.isinf(student_t_dof):
+        return float(chdtri(6, 1.0 - probability))
+    return float(6 * (student_t_dof - 2) / student_t_dof * fdtri(6, student_t_dof, probability))
 
 
 def _loops(found: LoopClosures) -> records.LoopMetrics:

@@ -20,9 +20,17 @@ from erfsfm.common.files import FolderLock, unfinished_name
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError, TrajectoryError
+from slam.runtime.files import (
+    ESTIMATE,
+    MAP_CLOUD,
+    MAP_MESH,
+    MEANINGS,
+    METRICS,
+    REPORT,
+    trajectory_file,
+    write_atomically,
+)
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, MEANINGS, METRICS, REPORT, trajectory_file
-from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import NOT_RECORDED
 
 logger = logging.getLogger(__name__)
@@ -86,17 +94,13 @@ class RunFolder:
             logger.warning("%s: %s: files that are there are whole", path, metrics.failure)
         return folder
 
-    def write_text(self, name: str, text: str) -> None:
-        """Write a text file atomically."""
-        self.write(name, lambda path: path.write_text(text, encoding="utf-8"))
-
-    def write(self, name: str, fill: Callable[[Path], object]) -> None:
-        """Write a file atomically: ``fill`` writes it under a temporary name."""
-        write_atomically(self.path / name, fill, RunError)
+    def write(self, name: str, content: str | Callable[[Path], object]) -> None:
+        """Write a file atomically: its text, or by a function that writes it under a temporary name."""
+        write_atomically(self.path / name, content, RunError)
 
     def write_metrics(self, metrics: Metrics) -> None:
         """Write ``metrics.json``."""
-        self.write_text(METRICS, metrics.to_json() + "\n")
+        self.write(METRICS, metrics.to_json() + "\n")
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
         """Write one of the trajectories (``network``, ``optimised``, ``reference`` ...) in both formats."""
@@ -141,14 +145,13 @@ class RunFolder:
         path = self.path / name
         if not path.is_file():
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
-            why = self._without_map() if name.endswith(".ply") else f"it holds {present}"
+            why = f"it holds {present}"
+            if name.endswith(".ply"):
+                metrics = self.metrics()
+                why = metrics.map.why("triangles")
+                why = (metrics.failure or "it ran without a map") if why == NOT_RECORDED else why
             raise RunError(f"{self.path} has no {name}: {why}")
         return path
-
-    def _without_map(self) -> str:
-        metrics = self.metrics()
-        why = metrics.map.why("triangles")
-        return (metrics.failure or "it ran without a map") if why == NOT_RECORDED else why
 
 
 def check_replaced(path: Path, begin: bytes | None = None) -> None:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slam.evaluation.depth import DepthErrors
-from slam.evaluation.map import ERRORS, OUTLIER_M, PlacedMetrics, compare, placed_metrics, pose_similarity
+from slam.evaluation.map import ERRORS, OUTLIER_M, PlacedMetrics, compare, placed_errors, pose_similarity
 from slam.evaluation.surface import RANGE_M, Indices, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import DepthMap, Intrinsics, Mask, Sequence
 from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.estimate import Estimate
-from slam.results.metrics import DepthOfKeyframes, MapMetrics
+from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.errors import Failed, SlamError
 from slam.sequences.recording import RecordedSequence
 from slam.sequences.simulated import SimulatedSequence
@@ -30,82 +31,65 @@ _MOST_PIXELS = 70_000  # of a depth map; larger ones are sampled
 _EVERY_RENDERED = 5  # rendering a keyframe's true depth takes as long as refining it
 
 
-class DepthTruth:
-    """Depth maps at true poses; ``distance`` is exact where the surface itself is known."""
+def depth_truth(sequence: RecordedSequence, reference: FloatArray) -> SurfaceTruth:
+    """Depth maps at true poses ``(N, 4, 4)``; ``distance`` is exact where the surface itself is known.
 
-    def __init__(self, sequence: RecordedSequence) -> None:
-        """The depth maps of a sequence with true poses."""
-        self._sequence = sequence
-        self.frames: Indices = np.asarray(sequence.true_depth_frames(), dtype=np.int64)
-        exact, T_any_camera = sequence.distance_to_surface, sequence.T_any_camera
-        self.name = "depth maps" if exact is None else "exact surface"
-        self.distance: Callable[[FloatArray], FloatArray] | None = None
-        if exact is not None and T_any_camera is not None:
-            self.distance = lambda points: exact(apply(T_any_camera[0], points))
+    A view is the surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m.
+    """
+    exact, T_any_camera = sequence.distance_to_surface, sequence.T_any_camera
+    distance: Callable[[FloatArray], FloatArray] | None = None
+    if exact is not None and T_any_camera is not None:
+        distance = lambda points: exact(apply(T_any_camera[0], points))  # noqa: E731
 
-    def view(self, frame: int) -> Surface:
-        """Surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m."""
-        assert self._sequence.reference is not None
-        T_world_camera, depth = self._sequence.reference[frame], self._sequence.true_depth(frame)
+    def view(frame: int) -> Surface:
+        T_world_camera, depth = reference[frame], sequence.true_depth(frame)
         height, width = depth.shape
-        camera = Intrinsics.of(self._sequence.intrinsics.resized(width, height))
+        camera = Intrinsics.of(sequence.intrinsics.resized(width, height))
         step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
         offset = frame % step  # other pixels in neighbouring frames
         rays = camera.rays(camera.pixel_grid()[offset::step, offset::step])
         points = backprojected(depth[offset::step, offset::step], rays, T_world_camera, _DEPTH_RANGE_M)
         return Surface(points, np.linalg.norm(points - T_world_camera[:3, 3], axis=1) <= RANGE_M)
 
-    def in_field(self, points: FloatArray, frames: Indices) -> Mask:
-        """All, for the map comes from the same images."""
+    def in_field(points: FloatArray, frames: Indices) -> Mask:  # all, for the map comes from the same images
         return np.ones(len(points), dtype=bool)
 
+    name = "depth maps" if exact is None else "exact surface"
+    return SurfaceTruth(name, np.array(sequence.true_depth_frames(), np.int64), view, in_field, distance)
 
-class LidarTruth:
-    """LiDAR scans at true poses, points within 25 m of the scanner; moving objects are among them.
 
-    A scan that cannot be read, of which LiDAR odometry has warned, has no point.
+def lidar_truth(sequence: Sequence, reference: FloatArray, T_camera_lidar: FloatArray) -> SurfaceTruth:
+    """LiDAR scans at true poses ``(N, 4, 4)``, points within 25 m of the scanner; moving objects are among them.
 
-    Completeness is about points in the images; the accuracy of the map is measured against all.
+    A scan that cannot be read, of which LiDAR odometry has warned, has no point. Completeness is about points in the
+    images; the accuracy of the map is measured against all. In the field are points within 25 m of a scanner, between
+    its lowest and its highest beam.
     """
+    limits: dict[int, tuple[float, float]] = {}  # sines of the lowest and the highest beam
 
-    name = "lidar"
-    distance: Callable[[FloatArray], FloatArray] | None = None
-
-    def __init__(self, sequence: Sequence) -> None:
-        """The scans of a sequence with true poses."""
-        self._sequence = sequence
-        self.frames: Indices = np.array([k for k in range(len(sequence)) if sequence.has_scan(k)], dtype=np.int64)
-        self._limits: dict[int, tuple[float, float]] = {}  # sines of the lowest and the highest beam
-
-    def view(self, frame: int) -> Surface:
-        """The points of one scan; points that project into its image are in the image."""
-        sequence = self._sequence
-        assert sequence.reference is not None and sequence.T_camera_lidar is not None
+    def view(frame: int) -> Surface:
         points = readable_scan(sequence, frame)
         if isinstance(points, str):
             points = np.empty((0, 3))
         ranges = np.linalg.norm(points, axis=1)
         sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
         beams = np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)  # stray points left out
-        self._limits[frame] = float(beams[0]), float(beams[1])
-        points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
-        return Surface(apply(sequence.reference[frame], points), _in_image(points, sequence.intrinsics))
+        limits[frame] = float(beams[0]), float(beams[1])
+        points = apply(T_camera_lidar, points[ranges <= RANGE_M])
+        return Surface(apply(reference[frame], points), _in_image(points, sequence.intrinsics))
 
-    def in_field(self, points: FloatArray, frames: Indices) -> Mask:
-        """Points within 25 m of a scanner, between its lowest and its highest beam."""
-        sequence = self._sequence
-        assert sequence.reference is not None and sequence.T_camera_lidar is not None
+    def in_field(points: FloatArray, frames: Indices) -> Mask:
         found = np.zeros(len(points), dtype=bool)
-        for frame in frames:
-            if int(frame) not in self._limits:
-                self.view(int(frame))
-            low, high = self._limits[int(frame)]
-            T_lidar_world = invert(sequence.reference[frame] @ sequence.T_camera_lidar)
-            seen = apply(T_lidar_world, points)
+        for frame in frames.tolist():
+            low, high = limits[frame]
+            seen = apply(invert(reference[frame] @ T_camera_lidar), points)
             ranges = np.linalg.norm(seen, axis=1)
             sine = seen[:, 2] / np.maximum(ranges, 1e-6)
             found |= (ranges <= RANGE_M) & (sine >= low) & (sine <= high)
         return found
+
+    frames = np.array([k for k in range(len(sequence)) if sequence.has_scan(k)], np.int64)
+    return SurfaceTruth("lidar", frames, view, in_field)
 
 
 def _in_image(points: FloatArray, camera: Intrinsics) -> Mask:
@@ -118,24 +102,25 @@ def _in_image(points: FloatArray, camera: Intrinsics) -> Mask:
 
 def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     """The best truth of a sequence, or why there is none."""
-    if sequence.reference is None:
+    reference, T_camera_lidar = sequence.reference, sequence.T_camera_lidar
+    if reference is None:
         return "the sequence has no true poses"
     if isinstance(sequence, RecordedSequence) and sequence.true_depth_frames():
-        return DepthTruth(sequence)
-    if sequence.T_camera_lidar is not None and (lidar := LidarTruth(sequence)).frames.size:
+        return depth_truth(sequence, reference)
+    if T_camera_lidar is not None and (lidar := lidar_truth(sequence, reference, T_camera_lidar)).frames.size:
         return lidar
     return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
 
 
-def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> MapMetrics:
-    """Errors of a map moved to the truth by one rigid motion, and under ``with_scale`` by a similarity.
+def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> dict[str, Any]:
+    """Values of `MapMetrics`: errors of a map moved to the truth rigidly, and under ``with_scale`` by a similarity.
 
     ``pieces`` iterates over the points of the map, ``(P, 3)`` each; of a long drive only those near the stretches that
     are looked at are held.
     """
     truth = find_truth(sequence)
     if isinstance(truth, str):
-        return MapMetrics.unknown(truth, *_MAP_ERRORS)
+        return dict.fromkeys(_MAP_ERRORS, Failed(truth))
     assert sequence.reference is not None
     poses = result.optimised.T_world_camera
     fits = {"with_scale": pose_similarity(sequence.reference, poses)}
@@ -148,14 +133,13 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
         distances, length_m = compare(truth, sequence.reference, placed)
     except SlamError as error:
         logger.warning("the error of the map is not known: %s", error)
-        return MapMetrics.unknown(str(error), *_MAP_ERRORS)
+        return dict.fromkeys(_MAP_ERRORS, Failed(str(error)))
     if truth.distance is None and len(distances["with_scale"].to_map) == 0:
-        return MapMetrics.unknown("no point of the true surface is known near the images", *_MAP_ERRORS)
-    with_scale = placed_metrics(PlacedMetrics, distances["with_scale"], scale=fits["with_scale"].scale)
-    more = {"truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
-    if "rigid" not in fits:
-        return MapMetrics.of(**dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale")), **more)
-    return placed_metrics(MapMetrics, distances["rigid"], **more)
+        return dict.fromkeys(_MAP_ERRORS, Failed("no point of the true surface is known near the images"))
+    no_metres = dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale"))
+    errors = placed_errors(distances["rigid"]) if "rigid" in fits else no_metres
+    with_scale = PlacedMetrics.of(**placed_errors(distances["with_scale"]), scale=fits["with_scale"].scale)
+    return {**errors, "truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
 
 
 def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> FloatArray:

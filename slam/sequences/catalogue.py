@@ -78,11 +78,6 @@ def sequence_kinds(dataset: Path) -> dict[str, str]:
     return {name: kind for name, (kind, _) in _contents(_root(dataset, None), Asked()).items()}
 
 
-def sequence_names(dataset: Path) -> list[str]:
-    """Names of the sequences in a data set; as `sequence_kinds`."""
-    return list(sequence_kinds(dataset))
-
-
 def _root(dataset: Path | None, name: str | None) -> Path:
     """The path given by the user or by the environment."""
     variable = os.environ.get(KITTI_VARIABLE)

@@ -86,7 +86,8 @@ def _nmea_rows(lines: Iterable[str]) -> list[tuple[int, list[float]]]:
         if words[0][-3:] != "GGA" or len(words) < 10 or words[6] in ("", "0") or not words[9]:
             continue
         try:
-            stamp = _seconds(words[1])
+            clock = words[1]
+            stamp = 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
             if stamp < before - _DAY_S / 2:
                 stamp += _DAY_S
             place = _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])
@@ -105,10 +106,6 @@ def _sentence(line: str) -> list[str]:
     if star and checksum.upper() != f"{reduce(xor, body.encode(), 0):02X}":
         return [""]
     return body.split(",")
-
-
-def _seconds(word: str) -> float:
-    return 3600 * int(word[:2]) + 60 * int(word[2:4]) + float(word[4:])
 
 
 def _degrees(word: str, side: str) -> float:

@@ -108,19 +108,17 @@ def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:
 # EuRoC: mav0/cam0/{data.csv,sensor.yaml,data/STAMP.png}, true poses of the body
 
 
-def _euroc_body(path: Path) -> Path | None:
-    """The folder of the sensors: ``mav0`` in a recording, or the one given."""
-    return next((place for place in (path / "mav0", path) if _euroc_camera(place) is not None), None)
+def _find_euroc(path: Path, asked: Asked) -> dict[str, Opener]:
+    """The left camera, else the right one, of the sensors in ``mav0`` of a recording, or in the folder given."""
+    path = path.absolute()
+    cameras = (body / name for body in (path / "mav0", path) for name in _EUROC_CAMERAS)
+    camera = next((camera for camera in cameras if (camera / "data.csv").is_file()), None)
+    return {} if camera is None else {camera.parents[1].name: partial(_open_euroc, camera, asked.camera)}
 
 
-def _euroc_camera(body: Path) -> Path | None:
-    return next((body / name for name in _EUROC_CAMERAS if (body / name / "data.csv").is_file()), None)
-
-
-def _open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
-    """The left camera, else the right one; rows of ``data.csv`` without an image are gaps in time."""
-    camera = _euroc_camera(body)
-    assert camera is not None
+def _open_euroc(camera: Path, asked: Path | None) -> RecordedSequence:
+    """Rows of ``data.csv`` without an image are gaps in time."""
+    body = camera.parent
     stamps, listed = _index(camera / "data.csv", camera / "data", in_nanoseconds=True)
     files, sensor = by_table(listed, camera / "data.csv"), camera / "sensor.yaml"
     stamps = stamps[files.first :][: len(files)]
@@ -372,11 +370,6 @@ def _loader(
         return {folder.name: partial(open_one, folder, asked.camera) for folder in found}
 
     return Loader(kind, layout, find)
-
-
-def _find_euroc(path: Path, asked: Asked) -> dict[str, Opener]:
-    body = _euroc_body(path.absolute())
-    return {} if body is None else {body.parent.name: partial(_open_euroc, body, asked.camera)}
 
 
 LOADERS = (

@@ -85,7 +85,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam download ", "it downloads; tests/slam/commands/downloads has a server"),
     (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/commands/calibration renders them"),
     (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_protocols.py has a short one"),
-    (r"truncation_voxels=12|make_figures.py ", "it wants frame 80 of KITTI's drive 0013"),
+    (r"mapping.voxel_size_m=0.1|make_figures.py ", "it wants frame 80 of KITTI's drive 0013"),
     (r"tools/reproduce.py ", "it trains the paper's networks"),
     (r"benchmark.py full-size ", "it wants images at the size of KITTI's cameras, and half an hour"),
     (r"benchmark.py handheld ", "it wants data sets, or minutes a room"),

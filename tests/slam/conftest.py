@@ -146,11 +146,11 @@ def make_run(tmp_path: Path) -> MakeRun:
             folder.write_trajectory(each, Trajectory(stamps, drive(300, step_m, yaw_bias)))
         if reference:
             folder.write_trajectory("reference", Trajectory(stamps, drive(300, 1.0, 0.0)))
-        folder.write_text("graph.g2o", G2O)
+        folder.write("graph.g2o", G2O)
         write_ply(folder.path / "map_mesh.ply", Ply(CORNERS, np.array([[0, 1, 2]])))
         write_ply(folder.path / "map_cloud.ply", Ply(CORNERS))
-        folder.write_text("config.yaml", "scale:\n  mode: auto\n")
-        folder.write_text("loops.json", '{"accepted": [{"from": 295, "to": 2}], "rejected": []}\n')
+        folder.write("config.yaml", "scale:\n  mode: auto\n")
+        folder.write("loops.json", '{"accepted": [{"from": 295, "to": 2}], "rejected": []}\n')
         folder.write_metrics(
             Metrics.model_validate(metrics if metrics is not None else metrics_of(reference=reference))
         )

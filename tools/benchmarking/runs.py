@@ -26,8 +26,8 @@ from slam.commands.batch import Drive, run_drives
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
-from slam.runtime.run_files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
-from slam.sequences.catalogue import sequence_names
+from slam.runtime.files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
+from slam.sequences.catalogue import sequence_kinds
 from slam.simulation.hazards import Hazard
 from slam.simulation.options import VERSION
 
@@ -160,7 +160,7 @@ def simulated(
 
 def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[BenchmarkSequence]:
     """The sequences of a KITTI odometry root, all of them or those named."""
-    chosen = names or sequence_names(kitti)
+    chosen = names or list(sequence_kinds(kitti))
     return [BenchmarkSequence(f"KITTI {name}", kitti, name, frames, kind="KITTI") for name in chosen]
 
 

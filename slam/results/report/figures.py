@@ -11,11 +11,12 @@ from plotly.subplots import make_subplots
 from scipy.spatial.transform import Rotation
 
 from slam.evaluation.drift import FIGURE_LENGTHS_M, aligned, paired, segment_errors
+from slam.formats.ply import R_UP_WORLD
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
 from slam.results.metrics import AcceptedLoop, Stretch
 from slam.results.report.map_view import MapView
-from slam.runtime.run_files import REFERENCE
+from slam.runtime.files import REFERENCE
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito (2008): for every eye
 LOOKS: dict[str, tuple[str, str | None, float, str]] = {  # label, colour (None: that of text), width, dash
@@ -27,7 +28,6 @@ LOOKS: dict[str, tuple[str, str | None, float, str]] = {  # label, colour (None:
 }
 _STRETCHES = 25  # of a path, over which lengths are compared
 _MAP, _PANEL = 560, 230  # heights, px
-_R_UP_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x right, y ahead, z up
 _SKY = "#e2e8ef"
 
 
@@ -54,7 +54,7 @@ def trajectories_figure(
 
 def map_figure(view: MapView) -> go.Figure:
     """The map in its colours with the camera's path through it, seen first from one of its places."""
-    points, path = (X @ _R_UP_WORLD.T for X in (view.mesh.points, view.T_world_camera[:, :3, 3]))
+    points, path = (X @ R_UP_WORLD.T for X in (view.mesh.points, view.T_world_camera[:, :3, 3]))
     corners = view.mesh.triangles.astype(np.uint16 if len(points) < 2**16 else np.int32)
     colours = [f"#{rgb:06x}" for rgb in view.mesh.colours.astype(np.int64) @ [1 << 16, 1 << 8, 1]]
     flat = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
@@ -72,7 +72,7 @@ def map_figure(view: MapView) -> go.Figure:
     # a unit of the scene is what is near, for it is clipped at a hundredth of one
     low, high = (f([f(points, axis=0), f(path, axis=0)], axis=0) for f in (np.min, np.max))
     size = np.maximum(high - low, 1e-3)
-    eye, forward = path[view.frame], _R_UP_WORLD @ view.T_world_camera[view.frame, :3, 2]
+    eye, forward = path[view.frame], R_UP_WORLD @ view.T_world_camera[view.frame, :3, 2]
     places = {"eye": eye, "center": eye + view.ahead * forward}
     ranges = zip(low.tolist(), (low + size).tolist())
     scene: dict[str, Any] = _by_axis(

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
+from slam.runtime.files import MAP_MESH
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import MAP_MESH
 
+_TRIANGLES = 60_000  # that a browser turns smoothly, in a page of 3 to 6 MB
 _COARSER = 1.15  # vertices of one surface do not all meet in its cells
 _FINER = 2  # triangles that quadric errors choose from, as a multiple of those that stay
 _MOST_TRIANGLES = 1_000_000  # that are thinned by quadric errors; a larger mesh is clustered first
@@ -43,13 +44,13 @@ class MapView:
     ahead: float
 
 
-def map_view(folder: RunFolder, triangles: int) -> MapView | None:
-    """The map with at most about so many triangles; None without ``map_mesh.ply``, or where none are wanted.
+def map_view(folder: RunFolder, triangles: int = _TRIANGLES) -> MapView | None:
+    """The map with at most about so many triangles; None without ``map_mesh.ply``.
 
     It is seen from that one of nine frames, evenly spread over the path, before which most vertices lie.
     """
     trajectory = folder.trajectory("optimised")
-    if not triangles or trajectory is None or not (folder.path / MAP_MESH).is_file():
+    if trajectory is None or not (folder.path / MAP_MESH).is_file():
         return None
     mesh = thinned_mesh(folder.path / MAP_MESH, triangles)
     poses = trajectory.T_world_camera

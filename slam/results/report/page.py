@@ -20,7 +20,7 @@ from slam.results.report.map_view import MapView
 from slam.results.report.verdict import verdict
 from slam.results.tables import alignments_table, errors_table, missing_errors
 from slam.runtime.errors import SlamError
-from slam.runtime.run_files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
+from slam.runtime.files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.storage.record import NOT_RECORDED
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def write_report(
         loop_pictures=loops,
         no_loops=_absence(metrics, metrics.loops.absent),
     )
-    folder.write_text(REPORT, page)
+    folder.write(REPORT, page)
 
 
 def _absence(metrics: Metrics, reason: str) -> str:

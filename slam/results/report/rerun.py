@@ -11,8 +11,8 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics
 from slam.pipeline.estimate import Estimate
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.files import write_atomically
 from slam.runtime.imports import import_extra
-from slam.runtime.storage.files import write_atomically
 
 _COLOURS = {"reference": (120, 120, 120), "odometry": (240, 150, 40), "optimised": (40, 110, 240)}
 _JPEG_QUALITY = 85

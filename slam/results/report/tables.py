@@ -13,7 +13,7 @@ from slam.evaluation.map import SurfaceMetrics
 from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES, Metrics, Stretch
 from slam.results.tables import written
-from slam.runtime.run_files import MEANINGS, REPORT
+from slam.runtime.files import MEANINGS, REPORT
 
 _MOST = 12  # of one kind
 _LEAST_SHARE = 0.005  # of the whole, that a table shows

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
 from erfsfm.common.config_tree import first_problem
 from erfsfm.common.files import read_text
@@ -115,13 +115,17 @@ class Record(BaseModel):
 
     def tree(self) -> dict[str, Any]:
         """The given values as JSON has them, in the order of the fields, reasons beside the missing ones."""
+        return self.model_dump()
+
+    @model_serializer
+    def _with_reasons_beside(self) -> dict[str, Any]:
         tree: dict[str, Any] = {}
         for name in self.names():
             if name not in self.model_fields_set:
                 continue
             key, value = type(self).model_fields[name].alias or name, getattr(self, name)
             absent = value.absent if isinstance(value, Record) else self.reasons.get(name, "")
-            tree[key] = None if absent else _plain(value)
+            tree[key] = None if absent else value
             if absent:
                 tree[f"{key}_reason"] = absent
         return tree
@@ -138,11 +142,3 @@ def part(kind: type[Record], alias: str | None = None) -> Any:
 
 def _is_part(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, Record)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Record):
-        return value.tree()
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    return [_plain(each) for each in value] if isinstance(value, list) else value

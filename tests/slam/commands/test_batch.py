@@ -131,8 +131,8 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
     quick = (
         "mapping: {enabled: false}\nvisual_odometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
     )
-    (here / "mine.yaml").write_text(quick + "loops: {frame_stride: 3}\n")
-    (data / "mine.yaml").write_text(quick + "loops: {frame_stride: 7}\n")
+    (here / "mine.yaml").write_text(quick + "depth: {frame_stride: 3}\n")
+    (data / "mine.yaml").write_text(quick + "depth: {frame_stride: 7}\n")
     words = ["batch", "../data/root", "--weights", "mine", "--config", "mine.yaml", "--frames", "0:6"]
     monkeypatch.chdir(here)
     code, out, err = command_line(main, "erfsfm-slam", *words, "--output", "out")

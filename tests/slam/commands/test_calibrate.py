@@ -18,7 +18,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
-from slam.commands.board import Board
+from slam.commands.calibration import Board
 from slam.commands.cli import main
 from slam.frames import Intrinsics
 from slam.sequences.catalogue import open_sequence

@@ -22,7 +22,7 @@ from slam.loops.descriptors import FeatureExtractor
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
-from slam.runtime.run_files import PLACES
+from slam.runtime.files import PLACES
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
@@ -61,7 +61,7 @@ def places() -> Places:
 def run(make_run: Callable[..., RunFolder]) -> RunFolder:
     folder = make_run()
     folder.write(PLACES, places().write)
-    folder.write_text("config.yaml", dump_yaml(load_config()))
+    folder.write("config.yaml", dump_yaml(load_config()))
     return folder
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.evaluation.map import PlacedMetrics, compare, double_wall_share, placed_metrics, pose_similarity
+from slam.evaluation.map import PlacedMetrics, compare, double_wall_share, placed_errors, pose_similarity
 from slam.evaluation.surface import Indices, Mask, Surface, accumulated, backprojected, stretches
 from slam.frames import Intrinsics
 from slam.geometry import se3
@@ -57,7 +57,7 @@ def straight(frames: int = 21, step_m: float = 1.0) -> FloatArray:
 
 def errors(points: FloatArray, exact: bool = False) -> dict[str, Any]:
     truth = Road(road(), np.arange(21), exact)
-    return placed_metrics(PlacedMetrics, compare(truth, straight(), {"map": points})[0]["map"]).tree()
+    return PlacedMetrics.of(**placed_errors(compare(truth, straight(), {"map": points})[0]["map"])).tree()
 
 
 @pytest.mark.parametrize("exact", [False, True])
@@ -98,7 +98,7 @@ def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
     points = road(36.0)
     points[np.abs(points[:, 0]) > 9.0, 1] -= 0.35
     truth = Road(road(36.0), np.arange(21))
-    found = placed_metrics(PlacedMetrics, compare(truth, straight(), {"map": points})[0]["map"]).tree()
+    found = PlacedMetrics.of(**placed_errors(compare(truth, straight(), {"map": points})[0]["map"])).tree()
     near, _, _, far, beyond = found["by_distance"]
     assert (near["from_m"], near["to_m"], beyond["to_m"]) == (0.0, 5.0, 25.0)
     assert near["accuracy_median_m"] == pytest.approx(0.0, abs=CLOSE_M) and near["f_score"]["0.2"] == 1.0
@@ -118,7 +118,7 @@ def test_only_the_road_of_known_surface_counts() -> None:
     distances, length_m = compare(
         truth, straight(200), {"map": np.concatenate([road(), road() + np.array([0.0, 0.0, 100.0])])}
     )
-    assert placed_metrics(PlacedMetrics, distances["map"]).outlier_share == 0.0
+    assert placed_errors(distances["map"])["outlier_share"] == 0.0
     assert length_m == pytest.approx(26.0)
 
 

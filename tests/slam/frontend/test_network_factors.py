@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from oracle import snippets_of
 
-from slam.evaluation.coverage import coverage
 from slam.frames import RelativePose
 from slam.frontend.network_factors import calibrate_network, chain_raw, network_factors, network_steps
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
+from slam.results.estimate_metrics import coverage
 
 COUNT = 300
 UNIT = 0.75  # of learned depth per unit of the network

@@ -7,7 +7,7 @@ from slam.frames import Frame, Intrinsics
 from slam.frontend import drive
 from slam.frontend.drive import Keyframe
 from slam.geometry import se3
-from slam.mapping import filters, surface
+from slam.mapping import filters, submap, surface
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import SlamError
@@ -52,7 +52,7 @@ def street_map(noise=lambda depth, k: depth, frames: int = 12, **config) -> Tsdf
 
 def test_keyframes_that_are_uncertain_everywhere_are_left_out_and_hide_no_neighbour():
     def driven(certain: range) -> TsdfMap:
-        tsdf_map = TsdfMap(MappingConfig(max_relative_sigma=0.3), CAMERA)
+        tsdf_map = TsdfMap(MappingConfig(), CAMERA)
         for k in range(9):
             T_world_camera, is_certain = pose(0.0, 0.0, float(k)), k in certain
             depth = street(T_world_camera[:3, 3]) * np.float32(1.0 if is_certain else 1.4)
@@ -67,7 +67,7 @@ def test_keyframes_that_are_uncertain_everywhere_are_left_out_and_hide_no_neighb
     assert np.quantile(distance_to_street(tsdf_map.mesh().points), 0.99) < 0.1
     nothing = driven(range(0))
     assert nothing.statistics()["frames_left_out"] == 9
-    with pytest.raises(SlamError, match=r"none of 9 keyframes .* mapping.max_relative_sigma=0.3"):
+    with pytest.raises(SlamError, match=r"none of 9 keyframes .* at most 0.3"):
         nothing.surface()
 
 
@@ -120,7 +120,8 @@ def test_flying_pixels_and_far_depth_are_left_out(monkeypatch):
         monkeypatch.setattr(filters, "_MAX_DEPTH_STEP", max_depth_step)
         monkeypatch.setattr(filters, "_MAX_DEPTH_DIFFERENCE", 10.0)
         monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
-        tsdf_map = TsdfMap(MappingConfig(truncation_voxels=4.5), CAMERA)
+        monkeypatch.setattr(submap, "TRUNCATION_VOXELS", 4.5)
+        tsdf_map = TsdfMap(MappingConfig(), CAMERA)
         for x in (0.0, 0.31):
             tsdf_map.integrate(KeyframeDepth(0, smeared, None, GREY, pose(x, 0.0, 0.0)))
         return tsdf_map.mesh().points

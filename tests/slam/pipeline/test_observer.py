@@ -231,9 +231,7 @@ def test_a_missing_image_is_an_error_where_gaps_are_switched_off() -> None:
         observe(20, missing, range(8, 10), "gaps.enabled=false")
 
 
-def test_too_many_unreadable_images_raise_their_error() -> None:
-    with pytest.raises(SequenceError, match=r"image 18\.png is truncated"):
-        run(unreadable, BAD, "gaps.max_unread_frames=3")
+def test_an_unreadable_image_raises_its_error_where_gaps_are_switched_off() -> None:
     with pytest.raises(SequenceError, match=r"image 15\.png is truncated"):
         run(unreadable, BAD, "gaps.enabled=false")
 

@@ -90,12 +90,20 @@ def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: Mak
     model.graph.node.append(helper.make_node("Reshape", ["whole", "shape"], ["depth"]))
     onnx.save(model, path)
     with pytest.raises(SlamError, match=r"net\.onnx fails on an image of 32x16: .*"):
-        opened(path, height=16, width=32)
+        opened(path, size=(16, 32))
     with pytest.raises(
         SlamError,
         match=r"must be floats of one map \(1, 1, H, W\) of at most 67,108,864 pixels; got float32 \(2, 14, 14\)",
     ):
-        opened(path, height=14, width=28)
+        opened(path, size=(14, 28))
+
+
+def test_the_size_is_that_of_the_file_or_is_set(make_network: MakeNetwork) -> None:
+    with pytest.raises(SlamError, match=r"any size: set depth\.size=\[HEIGHT,WIDTH\]"):
+        opened(make_network(shape=(1, 3, "height", "width")))
+    assert opened(make_network(), size=(16, 32)).disparity(Frame(0, 0.0, image())).shape == (16, 32)
+    with pytest.raises(SlamError, match=r"height and width \[16, 32\], not \[14, 28\]: leave depth\.size out"):
+        opened(make_network(), size=(14, 28))
 
 
 def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path) -> None:

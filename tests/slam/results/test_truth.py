@@ -17,6 +17,7 @@ from slam.frames import Intrinsics, Sequence
 from slam.frontend.scale.metric_scale import LengthUnit, Scale, ScaleEstimate
 from slam.geometry.se3 import FloatArray, apply
 from slam.mapping.filters import KeyframeDepth
+from slam.results.metrics import MapMetrics
 from slam.results.truth import DepthQuality, find_truth, map_errors, projected, true_depth
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
@@ -66,7 +67,7 @@ def errors(
         optimised=SimpleNamespace(T_world_camera=T_world_camera),
         scale=Scale(mode, ScaleEstimate(1.0, 0.0, 9), np.ones(1), {}, unit),
     )
-    return map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence).tree()
+    return MapMetrics.of(**map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence)).tree()
 
 
 def test_true_depth_at_true_poses_has_no_error(

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from slam.runtime.errors import SequenceError
-from slam.sequences.catalogue import open_sequence, sequence_kinds, sequence_names
+from slam.sequences.catalogue import open_sequence, sequence_kinds
 
 
 def test_several_sequences_are_listed(tmp_path: Path, odometry) -> None:
     for name in ("02", "10", "00"):
         odometry(tmp_path, name=name, frames=2)
-    assert sequence_names(tmp_path) == ["00", "02", "10"]
+    assert list(sequence_kinds(tmp_path)) == ["00", "02", "10"]
     with pytest.raises(SequenceError, match="has 3 sequences: 00, 02, 10; choose one with --sequence"):
         open_sequence(tmp_path, None, None, None)
     with pytest.raises(SequenceError) as caught:
@@ -26,7 +26,7 @@ def test_sequence_without_images_says_so(tmp_path: Path, odometry) -> None:
     odometry(tmp_path)
     (tmp_path / "sequences/09").mkdir()
     (tmp_path / "sequences/09/calib.txt").write_text("")
-    assert sequence_names(tmp_path) == ["00"]
+    assert list(sequence_kinds(tmp_path)) == ["00"]
     with pytest.raises(SequenceError, match=r"no images in .*09: looked for .*image_2"):
         open_sequence(tmp_path, "09", None, None)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slam.geometry import se3
-from slam.sequences.catalogue import open_sequence, sequence_names
+from slam.sequences.catalogue import open_sequence, sequence_kinds
 
 pytestmark = pytest.mark.data
 
@@ -41,8 +41,8 @@ def test_opens(data_root: Path, path: str, name: str | None, frames: int, length
 
 
 def test_roots_list_their_sequences(data_root: Path) -> None:
-    assert sequence_names(data_root / "kitti_odometry") == ["00", "02", "05"]
-    assert sequence_names(data_root / "kitti_raw") == ["2011_09_26_drive_0013"]
+    assert list(sequence_kinds(data_root / "kitti_odometry")) == ["00", "02", "05"]
+    assert list(sequence_kinds(data_root / "kitti_raw")) == ["2011_09_26_drive_0013"]
 
 
 def test_raw_drive_goes_forward_and_smoothly(data_root: Path) -> None:

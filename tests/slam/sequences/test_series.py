@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.sequences.catalogue import open_sequence, sequence_names
+from slam.sequences.catalogue import open_sequence, sequence_kinds
 
 
 def write_clip(path: Path, first: int, count: int = 20) -> None:
@@ -31,7 +31,7 @@ def test_chapters_of_a_camera(trip: Path) -> None:
     for k, name in enumerate(("GX010042", "GX020042", "GX030042")):
         write_clip(trip / f"{name}.avi", 20 * k)
     write_clip(trip / "GX010043.avi", 200)
-    assert sorted(sequence_names(trip)) == ["GX010042", "GX010043"]
+    assert sorted(sequence_kinds(trip)) == ["GX010042", "GX010043"]
     sequence = open_sequence(trip, "GX010042")
     np.testing.assert_allclose(shown(sequence), range(60), atol=2)
     np.testing.assert_allclose(sequence.stamps, 0.1 * np.arange(60), atol=1e-6)
@@ -45,7 +45,7 @@ def test_chapters_of_a_camera(trip: Path) -> None:
 def test_files_named_by_their_time(trip: Path) -> None:
     for k, second in enumerate((0, 2, 4, 8, 59)):
         write_clip(trip / f"20240101_1200{second:02d}_F.avi", 20 * k)
-    assert sorted(sequence_names(trip)) == ["20240101_120000_F", "20240101_120059_F"]
+    assert sorted(sequence_kinds(trip)) == ["20240101_120000_F", "20240101_120059_F"]
     sequence = open_sequence(trip, "20240101_120000_F")
     assert len(sequence) == 80
     np.testing.assert_allclose(np.diff(sequence.stamps)[[19, 39, 59]], [0.1, 0.1, 2.1], atol=1e-6)

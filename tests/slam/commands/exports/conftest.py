@@ -17,7 +17,7 @@ from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
-from slam.runtime.run_files import PLACES
+from slam.runtime.files import PLACES
 
 CAMERA = Intrinsics(80, 48, 60.0, 61.0, 40.5, 22.25)
 FRAMES = 8

@@ -15,7 +15,7 @@ from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
-from slam.runtime.run_files import PLACES
+from slam.runtime.files import PLACES
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.street import SimulationOptions
 

@@ -15,7 +15,7 @@ from slam.frames import Intrinsics
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
-from slam.runtime.run_files import PLACES
+from slam.runtime.files import PLACES
 
 MakeRun = Callable[..., RunFolder]
 

@@ -20,8 +20,8 @@ from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
+from slam.runtime.files import PLACES
 from slam.runtime.imports import import_open3d
-from slam.runtime.run_files import PLACES
 from slam.sequences.catalogue import open_sequence
 
 MakeRecorded = Callable[..., RunFolder]

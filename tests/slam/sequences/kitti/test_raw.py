@@ -5,7 +5,7 @@ import pytest
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
-from slam.sequences.catalogue import open_sequence, sequence_names
+from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.kitti import T_world_imu
 
 FRAMES = 5
@@ -85,7 +85,7 @@ def test_reference_drives_along_z(tmp_path: Path, late_s: float) -> None:
 def test_root_with_several_drives(tmp_path: Path) -> None:
     write_drive(tmp_path)
     write_drive(tmp_path, name=f"{DATE}_drive_0014")
-    assert sequence_names(tmp_path) == [NAME, f"{DATE}_drive_0014"]
+    assert list(sequence_kinds(tmp_path)) == [NAME, f"{DATE}_drive_0014"]
     with pytest.raises(SequenceError, match="has 2 sequences"):
         open_sequence(tmp_path, None, None, None)
     assert open_sequence(tmp_path, f"{DATE}_drive_0014", None, None).name == f"{DATE}_drive_0014"

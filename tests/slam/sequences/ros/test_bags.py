@@ -17,7 +17,7 @@ from slam.commands.doctor import examine
 from slam.frames import Intrinsics
 from slam.runtime import imports
 from slam.runtime.errors import SequenceError, SlamError
-from slam.sequences.catalogue import open_sequence, sequence_names
+from slam.sequences.catalogue import open_sequence, sequence_kinds
 
 CAMERA = Intrinsics(40, 24, 30, 30, 20, 12)
 FIRST_NS, STEP_NS, FRAMES = 1403715273262142976, 50_000_000, 6
@@ -46,7 +46,7 @@ def test_opens(new_bag: NewBag, kind: str) -> None:
     assert sequence.provenance() == ("bag/walk[0:6]",) and sequence.reference is None
     for k in (0, 1, 5, 2, 3, 0):
         assert np.array_equal(sequence.frame(k).image, np.repeat(picture(k)[:, :, None], 3, axis=2))
-    assert sequence_names(path) == ["/cam0/image_raw"]
+    assert list(sequence_kinds(path)) == ["/cam0/image_raw"]
     if path.is_dir():
         (file,) = (file for file in path.iterdir() if file.suffix in (".db3", ".mcap"))
         assert open_sequence(file).stamps.tolist() == sequence.stamps.tolist()
@@ -123,7 +123,7 @@ def test_rectified_images_stand_for_the_raw_ones_beside_them(new_bag: NewBag, ki
     bag = new_bag(kind)
     drive(bag)
     bag.image("/cam0/image_rect", FIRST_NS, picture(0), "mono8")
-    (name,) = sequence_names(path := bag.close())
+    (name,) = list(sequence_kinds(path := bag.close()))
     assert name == "/cam0/image_rect" and open_sequence(path).intrinsics.fx == 31
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.storage.files import write_atomically
+from slam.runtime.files import write_atomically
 
 
 def test_makes_folders_and_replaces_what_was_there(tmp_path: Path) -> None:

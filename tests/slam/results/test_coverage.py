@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.evaluation.coverage import coverage, squared_bound
 from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
+from slam.results.estimate_metrics import coverage, squared_bound
 
 SIGMAS = np.repeat([0.003, 0.03], 3)
 COUNT = 3000

@@ -23,7 +23,6 @@ BLOCK_VOXELS = BLOCK_SIDE**3
 TILE_BLOCKS = 16
 SEED_STRIDE = 4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
 TRUNCATION_VOXELS = 10.0  # of the signed distance: 4 lose completeness, 12 accuracy (docs/design/tried-without-success)
-_LEAST_TRUNCATION = 0.043  # of the farthest fused depth, 1.2 m of 28: its noise does not shrink with the voxels
 _CAPACITY = 1000  # blocks of 32 KiB; growing takes Open3D a moment
 _MOST_WEIGHT = np.iinfo(np.uint16).max
 _REMEMBERED = 4  # submaps; neighbouring tiles need the same ones
@@ -93,7 +92,6 @@ class Fusion:
         """An empty submap of depth maps of this camera; depth beyond ``reach_m`` is not fused."""
         self._grid = new_grid(voxel_size_m)
         self._reach = reach_m
-        self._truncation_voxels = max(TRUNCATION_VOXELS, _LEAST_TRUNCATION * reach_m / voxel_size_m)
         self.length = 0.0  # of the way between fused frames
         self._position: FloatArray | None = None
         K = camera.K
@@ -114,7 +112,7 @@ class Fusion:
         o3d = import_open3d()
         image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
         T_camera_world = o3d.core.Tensor(invert(T_world_camera))  # what Open3D calls extrinsic
-        how = (self._K, T_camera_world, 1.0, self._reach, self._truncation_voxels)
+        how = (self._K, T_camera_world, 1.0, self._reach, TRUNCATION_VOXELS)
         self._grid.integrate(self._grid.compute_unique_block_coordinates(image, *how), image, *how)
         position = T_world_camera[:3, 3]
         self.length += 0.0 if self._position is None else float(np.linalg.norm(position - self._position))

@@ -62,7 +62,7 @@ def against_reference(
 
 def of_runs(paths: Sequence[Path], as_json: bool) -> None:
     """Run folders side by side."""
-    runs = [RunFolder.open(path) for path in paths]
+    runs = [(folder.path, folder.metrics()) for folder in map(RunFolder.open, paths)]
     if as_json:
         typer.echo(json.dumps(runs_json(runs), indent=2))
     else:

@@ -19,6 +19,7 @@ from typing import Any
 from erfsfm.common.files import FolderLock, unfinished_name
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.metrics import Metrics
+from slam.results.tables import errors_table
 from slam.runtime.errors import RunError, TrajectoryError
 from slam.runtime.files import (
     ESTIMATE,
@@ -129,8 +130,6 @@ class RunFolder:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: errors, and the unit of lengths."""
-        from slam.results.tables import errors_table
-
         metrics = self.metrics()
         title = f"{metrics.sequence.name or self.path.name}: {metrics.sequence.frames or 0} frames"
         errors = metrics.evaluated_errors()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from erfsfm.common.table import DASH, Table
 from slam.evaluation.trajectory import ALIGNMENTS, AlignedMetrics, TrajectoryMetrics
-
-if TYPE_CHECKING:
-    from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics
 
 UNITS = "ATE: RMSE, m; of snippets of five frames, each with its own scale, norm / 5. RE: rad. t_rel, r_rel: 7 dof."
 _LEAK = "LEAK: the weights were trained on the sequence; the numbers are no test."
@@ -72,14 +71,13 @@ def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
     return Table(["alignment", *(each.header for each in statistics.values())], rows, title, notes)
 
 
-def runs_table(runs: Sequence[RunFolder]) -> Table:
+def runs_table(runs: Sequence[tuple[Path, Metrics]]) -> Table:
     """One row for each run and trajectory; runs that failed or were killed with the reason."""
     rows: list[list[str]] = []
     notes: dict[str, None] = {UNITS: None}
-    names = [run.path.resolve().name for run in runs]
-    for run, short in zip(runs, names, strict=True):
-        title = name = str(run.path) if names.count(short) > 1 else short
-        metrics = run.metrics()
+    names = [path.resolve().name for path, _ in runs]
+    for (path, metrics), short in zip(runs, names, strict=True):
+        title = name = str(path) if names.count(short) > 1 else short
         errors = metrics.evaluated_errors()
         if metrics.failure:
             ended = "failed" if metrics.status == "failed" else "did not end"
@@ -98,13 +96,12 @@ def runs_table(runs: Sequence[RunFolder]) -> Table:
     return Table(head, rows, "Errors against the reference", list(notes), names=2)
 
 
-def runs_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
+def runs_json(runs: Sequence[tuple[Path, Metrics]]) -> list[dict[str, Any]]:
     """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory."""
     objects = []
-    for run in runs:
-        metrics = run.metrics()
+    for path, metrics in runs:
         tree = metrics.tree()
-        entry: dict[str, Any] = {"run": str(run.path), "status": metrics.status}
+        entry: dict[str, Any] = {"run": str(path), "status": metrics.status}
         if metrics.failure:
             entry["reason"] = metrics.failure
         entry["leak"] = metrics.provenance.leak

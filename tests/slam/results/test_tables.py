@@ -29,10 +29,14 @@ def printed(capsys: pytest.CaptureFixture[str]) -> Callable[[Table], str]:
     return text
 
 
+def side_by_side(runs: list[RunFolder]) -> Table:
+    return runs_table([(run.path, run.metrics()) for run in runs])
+
+
 def test_runs_are_shown_side_by_side_with_their_numbers(
     make_run: MakeRun, make_metrics: MakeMetrics, printed: Callable[[Table], str]
 ) -> None:
-    text = printed(runs_table([make_run("first"), make_run("second", make_metrics(mode="none"))]))
+    text = printed(side_by_side([make_run("first"), make_run("second", make_metrics(mode="none"))]))
     assert "first" in text and "second" in text
     assert text.count("0.870") == 2  # ATE of the optimised trajectories, 7 dof
     assert "Scale mode none" in text and "LEAK" not in text
@@ -41,7 +45,7 @@ def test_runs_are_shown_side_by_side_with_their_numbers(
 def test_a_leak_and_missing_numbers_are_noted(
     make_run: MakeRun, make_metrics: MakeMetrics, printed: Callable[[Table], str]
 ) -> None:
-    text = printed(runs_table([make_run("seen", make_metrics(leak=True))]))
+    text = printed(side_by_side([make_run("seen", make_metrics(leak=True))]))
     assert "seen, LEAK" in text
     assert "lidar: the sequence has no LiDAR scans" in text and "odometry: no segment of 100 m was left" in text
 
@@ -52,7 +56,7 @@ def test_a_run_that_did_not_end_has_its_reason(
 ) -> None:
     failed = {"schema": 1, "status": status, "reason": "no motion [bold]between[/bold] frames", "provenance": None}
     early = make_run("early", make_metrics() | {"status": status, "reason": "no space left"})
-    text = printed(runs_table([early, make_run("bad", failed)]))
+    text = printed(side_by_side([early, make_run("bad", failed)]))
     assert f"bad {word}: no motion [bold]between[/bold] frames" in text
     assert "0.870" in text and f"early {word}: no space left" in text
 

@@ -31,15 +31,12 @@ from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.prediction.assembly import Prediction, open_prediction
-from slam.prediction.depth_folder import FrameNumbers
+from slam.prediction.depth_source import FrameNumbers
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
-from slam.results.folder import RunFolder, check_output
+from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
-from slam.results.report.map_view import map_view
-from slam.results.report.page import Picture, write_report
-from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
 from slam.results.report.rerun import write_rerun
-from slam.results.run_log import RunLog, run_log
 from slam.results.truth import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
 from slam.runtime.files import (
@@ -209,6 +206,8 @@ class FolderRecorder(Recorder):
 
         def reported() -> None:
             if self._settings.output.report:
+                from slam.results.report.figures import map_view  # with Plotly, which is slow to import
+
                 pictures = self._depths.pictures(), self._loop_pictures(estimate)
                 write_report(self.folder, *pictures, map_view(self.folder), metrics)
 

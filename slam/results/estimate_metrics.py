@@ -29,7 +29,7 @@ from slam.pipeline.estimate import Estimate
 from slam.results import metrics as records
 from slam.results.metrics import Metrics
 from slam.runtime.errors import Failed
-from slam.runtime.timing import Stopwatch, peak_rss_mb
+from slam.runtime.resources import Stopwatch, peak_rss_mb
 
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")

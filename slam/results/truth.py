@@ -19,8 +19,8 @@ from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.estimate import Estimate
 from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.errors import Failed, SlamError
+from slam.sequences.catalogue import SimulatedSequence
 from slam.sequences.recording import RecordedSequence
-from slam.sequences.simulated import SimulatedSequence
 
 logger = logging.getLogger(__name__)
 

@@ -23,10 +23,10 @@ from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
+from slam.sequences.camera_file import Undistortion, require_size, undistorted
 from slam.sequences.gps import FASTEST_M_S
 from slam.sequences.images import ImageFiles, ImageSource, ReadImages, too_long
 from slam.sequences.poses import known_poses, rebased
-from slam.sequences.undistortion import Undistortion, require_size, undistorted
 
 logger = logging.getLogger(__name__)
 

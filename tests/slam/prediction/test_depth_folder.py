@@ -11,7 +11,7 @@ import pytest
 
 from slam.config.sections import DepthConfig
 from slam.frames import Frame
-from slam.prediction.depth_folder import DepthFolder, FrameNumbers
+from slam.prediction.depth_source import DepthFolder, FrameNumbers
 from slam.runtime.errors import SlamError
 
 HEIGHT, WIDTH = 12, 40

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper
 
 from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
-from slam.prediction.onnx_depth import OnnxDepth
+from slam.prediction.depth_source import OnnxDepth
 from slam.runtime.errors import SlamError
 
 MakeNetwork = Callable[..., Path]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from slam.results.run_log import run_log
+from slam.results.folder import run_log
 
 LOGGER = logging.getLogger("slam.test")
 

@@ -20,9 +20,8 @@ from slam.mapping.filters import KeyframeDepth
 from slam.results.metrics import MapMetrics
 from slam.results.truth import DepthQuality, find_truth, map_errors, projected, true_depth
 from slam.runtime.errors import SequenceError
-from slam.sequences.catalogue import open_sequence
+from slam.sequences.catalogue import SimulatedSequence, open_sequence
 from slam.sequences.recording import RecordedSequence, Source
-from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 

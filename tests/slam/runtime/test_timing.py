@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from slam.runtime.timing import Stopwatch
+from slam.runtime.resources import Stopwatch
 
 
 def test_a_stage_adds_up_over_its_visits_also_when_it_fails() -> None:

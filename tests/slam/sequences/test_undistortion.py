@@ -5,7 +5,7 @@ import pytest
 from erfsfm.common.readers.camera_file import CameraFile
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
-from slam.sequences.undistortion import Undistortion
+from slam.sequences.camera_file import Undistortion
 
 WIDTH, HEIGHT = 320, 240
 LENSES = {

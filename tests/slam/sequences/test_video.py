@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.video import VideoFrames
-from slam.sequences import folder as video
+from slam.sequences import loader
 from slam.sequences.catalogue import open_sequence
 
 
@@ -108,7 +108,7 @@ def test_frames_and_times_of_a_long_video_are_those_of_its_packets(
 ) -> None:
     """An mkv announces a guess: its duration times a rate."""
     path = write_mp4(tmp_path / f"long{suffix}", UNEVEN)
-    monkeypatch.setattr(video, "VideoFrames", partial(VideoFrames, counted_frames=4))
+    monkeypatch.setattr(loader, "VideoFrames", partial(VideoFrames, counted_frames=4))
     sequence = open_sequence(path, camera=Path("fov=70"))
     assert sequence.stamps == pytest.approx(np.array(UNEVEN) / 600, abs=5e-4)
     assert ("announces 14 frames and has 10" in caplog.text) == (suffix == ".mkv")

@@ -14,7 +14,7 @@ import pytest
 
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.report.map_view import MapView
+from slam.results.report.figures import MapView
 from slam.results.report.page import Picture, write_report
 
 MakeRun = Callable[..., RunFolder]

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.verification import Loop
 from slam.mapping.filters import KeyframeDepth
-from slam.results.report.page import Picture
-from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.report.page import DepthPictures, Picture, loop_pictures
 
 
 def pixels(picture: Picture) -> NDArray[np.uint8]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.spill import SpillFile
+from slam.runtime.resources import SpillFile
 
 
 def test_arrays_come_back_in_any_order() -> None:

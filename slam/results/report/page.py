@@ -18,6 +18,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
+from erfsfm.common.readers.images import resize_image
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image, Intrinsics
 from slam.loops.verification import Loop
@@ -218,9 +219,7 @@ def _joined(first: Image, second: Image, ends: NDArray[np.floating]) -> Image:
 
 def narrowed(image: Image, width: int) -> Image:
     """An image at another width."""
-    height = max(round(image.shape[0] * width / image.shape[1]), 1)
-    method = cv2.INTER_AREA if width < image.shape[1] else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, (width, height), interpolation=method), np.uint8)
+    return resize_image(image, max(round(image.shape[0] * width / image.shape[1]), 1), width)
 
 
 def _picture(image: Image, title: str) -> Picture:

@@ -80,7 +80,7 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
     Every message goes to ``emit``. The first ctrl-C, SIGTERM or SIGHUP ends the stream, another one the run.
 
     Raises:
-        SlamError, ErfsfmError: one line; as ``slam.commands.run.run.run_slam``.
+        SlamError, ErfsfmError: one line; as ``slam.commands.run.run_slam``.
     """
     with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
         if request.output is not None:

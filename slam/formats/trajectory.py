@@ -168,11 +168,16 @@ def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps are written with all their digits."""
-    quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
-    poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
+    poses = translations_and_quaternions(trajectory.T_world_camera)
     stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
     lines = (f"{stamp} {_row(pose)}\n" for stamp, pose in zip(stamps, poses))
     write_atomically(Path(path), "".join(["# timestamp tx ty tz qx qy qz qw\n", *lines]), TrajectoryError)
+
+
+def translations_and_quaternions(T_a_b: FloatArray) -> FloatArray:
+    """Translation and quaternion (xyzw) ``(N, 7)`` of poses ``(N, 4, 4)``."""
+    quaternions_xyzw = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat(canonical=True)
+    return np.concatenate([T_a_b[:, :3, 3], quaternions_xyzw], axis=1)
 
 
 def associate(
@@ -185,7 +190,6 @@ def associate(
     numbers where one of the two has them, and else row k belongs to row k.
 
     Of ``frames`` only these rows [start, stop) of the reference count; an estimate of as many rows is of these frames.
-    ``TrajectoryError``: the lengths differ and stamps or frame numbers are missing, or none match.
 
     Raises:
         TrajectoryError: if the lengths differ and stamps or frame numbers are missing, or none match.

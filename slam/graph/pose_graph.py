@@ -18,6 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry.se3 import FloatArray, invert, is_se3
 from slam.runtime.errors import SlamError
@@ -144,8 +145,10 @@ class PoseGraph:
     def write_g2o(self, path: Path) -> None:
         """Write the optimised graph in g2o's text format at full precision, atomically."""
         T_from_to = np.array([edge.T_from_to for edge in self.relative_poses]).reshape(-1, 4, 4)
-        lines = [f"{_VERTEX} {k} {_numbers(pose)}" for k, pose in enumerate(_g2o_poses(self._solution()))]
-        for edge, pose in zip(self.relative_poses, _g2o_poses(T_from_to), strict=True):
+        lines = [
+            f"{_VERTEX} {k} {_numbers(pose)}" for k, pose in enumerate(translations_and_quaternions(self._solution()))
+        ]
+        for edge, pose in zip(self.relative_poses, translations_and_quaternions(T_from_to), strict=True):
             information = np.diag(1.0 / edge.graph_sigmas[_TRANSLATION_FIRST] ** 2)[_UPPER]
             lines.append(f"{_EDGE} {edge.from_index} {edge.to_index} {_numbers(pose)} {_numbers(information)}")
         write_atomically(path, "\n".join([*lines, ""]))
@@ -241,12 +244,6 @@ def _check(edge: RelativePose) -> None:
 
 def _pose3(T_a_b: FloatArray) -> Any:
     return gtsam.Pose3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3])
-
-
-def _g2o_poses(T_a_b: FloatArray) -> FloatArray:
-    """Translation and quaternion (xyzw) ``(N, 7)`` of poses ``(N, 4, 4)``."""
-    quaternions_xyzw = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat(canonical=True)
-    return np.concatenate([T_a_b[:, :3, 3], quaternions_xyzw], axis=1)
 
 
 def _numbers(row: FloatArray) -> str:

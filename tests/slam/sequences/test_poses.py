@@ -1,4 +1,4 @@
-"""True poses from a file of the user, for any recording."""
+"""True poses from a file of the user, for any recording; GPS tracks as they are written, and files that are none."""
 
 from __future__ import annotations
 

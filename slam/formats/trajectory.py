@@ -285,8 +285,7 @@ def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.int
     if len(candidates) == 1:
         return np.zeros(len(stamps), dtype=np.intp)
     before_is_nearer = stamps - candidates[after - 1] <= candidates[after] - stamps
-    nearest: NDArray[np.intp] = np.where(before_is_nearer, after - 1, after)
-    return nearest
+    return np.asarray(np.where(before_is_nearer, after - 1, after))
 
 
 def _read_numbers(

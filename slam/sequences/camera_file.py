@@ -270,8 +270,7 @@ class Undistortion:
                 f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: "
                 "give the calibration of this camera at this size"
             )
-        flat: Image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return flat
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
     def apply_to_depth(self, depth: DepthMap) -> DepthMap:
         """Undistort z-depth ``(H, W)`` of an image, not positive or not finite where unknown."""
@@ -287,8 +286,7 @@ class Undistortion:
         else:
             points = np.column_stack([rays, np.ones(len(rays))])
             distorted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self._K, self._coefficients)
-        seen: FloatArray = np.asarray(distorted, dtype=np.float64).reshape(-1, 2)
-        return seen
+        return np.asarray(distorted, dtype=np.float64).reshape(-1, 2)
 
     def _bend(self, rays: FloatArray) -> FloatArray:
         """The FOV lens (Devernay and Faugeras 2001): radii in the image grow with the angle of a ray."""

@@ -213,14 +213,9 @@ class SimulatedSequence(RecordedSequence):
     def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
         street = self.street = simulated_world(options)
         rendered = functools.lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index).image)
-
-        def read(index: int) -> Image:
-            image: Image = rendered(index).copy()
-            return image
-
         super().__init__(
             name,
-            ReadImages(options.width, options.height, options.frames, read),
+            ReadImages(options.width, options.height, options.frames, lambda index: np.array(rendered(index))),
             street.camera,
             uniform_stamps(options.frames, options.rate),
             (Source(f"simulated/{options.seed}", first=None),),

@@ -266,8 +266,7 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
     rows, skipped = assigned
     if len(rows) == len(files):
         return stamps[skipped:]
-    spread: FloatArray = np.interp(np.arange(len(files)), rows, stamps)
-    return spread
+    return np.asarray(np.interp(np.arange(len(files)), rows, stamps))
 
 
 def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:

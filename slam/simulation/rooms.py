@@ -9,16 +9,13 @@ from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, IntArray, Material, Mesh, Moving
-from slam.simulation.hazards import SHUTTER
-from slam.simulation.house import Floor, House, draw_house
-from slam.simulation.interior import Interior, furnish
-from slam.simulation.motion import Carried, carry
+from slam.simulation.house import Interior
+from slam.simulation.motion import Carried, Floor, carry
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
-from slam.simulation.sensors import square_camera
 from slam.simulation.surface import Hits, Surface, place_rays, unlit
 from slam.simulation.texture import GLOWING
-from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
+from slam.simulation.world import SHUTTER, SimulatedWorld, in_bytes, square_camera, through_lens
 
 STILL_S = 3.0
 _USUAL_FOV_DEG, _VARIED_FOV_DEG = 65.0, (55.0, 100.0)
@@ -38,8 +35,8 @@ class SimulatedRooms(SimulatedWorld):
         """Plan the house and the walk; ``SequenceError`` where there are too few frames."""
         if options.frames < 2:
             raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
-        house, self._interior = _furnished_house(options.seed)
-        floor = Floor(house, self._interior.obstacles, options.seed)
+        self._interior = _interior(options.seed)
+        floor = Floor(self._interior, options.seed)
         seconds = options.frames / options.rate + _AHEAD_S + 1.0
         motions = _PEOPLE if "people" in options.hazards else 1
         self._carried = carry(floor, options.motion or "walk", seconds, options.rate, options.seed)
@@ -151,25 +148,19 @@ class SimulatedRooms(SimulatedWorld):
         return float(np.minimum(light * colours[self._still.mesh.instance[triangle]], 1.5).mean())
 
 
+_interior = functools.lru_cache(maxsize=4)(Interior)  # which several motions and hazards share
 _GLOW = np.array([GLOWING.get(material, 0.0) for material in Material], dtype=np.float32)
 _METER_WEIGHT = float(np.exp(-_METER_S * np.arange(_METERED) / 0.35).sum())
-
-
-@functools.lru_cache(maxsize=4)
-def _furnished_house(seed: int) -> tuple[House, Interior]:
-    """A house, which several motions and hazards share."""
-    house = draw_house(seed)
-    return house, furnish(house, seed)
 
 
 @functools.lru_cache(maxsize=2)
 def _illuminated(seed: int, some_are_dim: bool) -> Float32Array:
     """Irradiance in a house, some rooms of which may be dim."""
-    house, interior = _furnished_house(seed)
+    interior = _interior(seed)
     lights = interior.lights.copy()
     if some_are_dim:
-        strength = np.exp(np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(house.rooms)))
-        for room, factor in zip(house.rooms, strength):
+        strength = np.exp(np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(interior.house.rooms)))
+        for room, factor in zip(interior.house.rooms, strength):
             lights[room.contains(lights[:, :2]), 3] *= factor
     return illuminate(Surface.of(interior.mesh), lights)
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from slam.simulation import objects
 from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
-from slam.simulation.streets import StreetPlan
+from slam.simulation.route import StreetPlan
 
 KERB = 0.13  # height of pavements above the road, metres
 LANE = 3.6  # width on a motorway, metres

@@ -13,9 +13,10 @@ from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.simulation.options import SimulationOptions
-from slam.simulation.surface import Hits, Surface, distances, facing_normals, place_rays
+from slam.simulation.surface import Hits, Surface, distances, place_rays
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
+SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 
 
 @dataclass(frozen=True)
@@ -142,11 +143,13 @@ class SimulatedWorld(ABC):
             triangle = answer["primitive_ids"][seen].astype(np.int64)
             order = np.argsort(np.take(surface.mesh.material, triangle), kind="stable")
             seen, triangle = seen[order], triangle[order]
+            rays_seen = np.take(unit, seen, axis=1)
+            normals = np.take(surface.mesh.normals, triangle, axis=1)
             hits = Hits(
                 triangle=triangle,
                 barycentric=np.take(answer["primitive_uvs"], seen, axis=0).T,
-                rays=np.take(unit, seen, axis=1),
-                normals=facing_normals(surface.mesh, triangle, np.take(unit, seen, axis=1)),
+                rays=rays_seen,
+                normals=np.asarray(normals * -np.sign((normals * rays_seen).sum(axis=0))),  # turned towards the viewer
                 depth=depth[seen],
                 distance=depth[seen] * self._stretch[seen],
             )
@@ -157,6 +160,12 @@ class SimulatedWorld(ABC):
     def _require(self, index: int) -> None:
         if not 0 <= index < len(self):
             raise IndexError(f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}")
+
+
+def square_camera(width: int, height: int, fov_deg: float) -> Intrinsics:
+    """Of square pixels with a horizontal field of view, its centre in the middle."""
+    focal_px = float(0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg)))
+    return Intrinsics(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))
 
 
 def through_lens(rgb: Float32Array, blur_px: float = 0.55) -> Float32Array:

@@ -11,10 +11,9 @@ from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import FLAT, Material, Soup
 from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.options import SimulationOptions
+from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.street import SimulatedStreet
 from slam.simulation.surface import Surface, place_rays
-from slam.simulation.variety import draw_variety
 
 SMALL = {"width": 208, "height": 64}
 

@@ -14,7 +14,7 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply
 from slam.frames import Intrinsics
-from slam.mapping.filters import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
+from slam.mapping.depth import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
 from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
 from slam.mapping.views import ViewChooser

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
-from slam.mapping.filters import DepthFilters, KeyframeDepth, sampled
+from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.mapping.submap import MergedSubmaps
 
 _STEP = 0.1  # of the largest fused depth

@@ -10,12 +10,24 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slam.evaluation.depth import DepthErrors
-from slam.evaluation.map import ERRORS, OUTLIER_M, PlacedMetrics, compare, placed_errors, pose_similarity
-from slam.evaluation.surface import RANGE_M, Indices, Surface, SurfaceTruth, backprojected, stretches
+from slam.evaluation.map import (
+    ERRORS,
+    OUTLIER_M,
+    RANGE_M,
+    Indices,
+    PlacedMetrics,
+    Surface,
+    SurfaceTruth,
+    backprojected,
+    compare,
+    placed_errors,
+    pose_similarity,
+    stretches,
+)
 from slam.frames import DepthMap, Intrinsics, Mask, Sequence
 from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.pipeline.estimate import Estimate
 from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.errors import Failed, SlamError

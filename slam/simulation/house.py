@@ -14,10 +14,19 @@ from slam.simulation.geometry import FLAT, FloatArray, Material, Soup
 from slam.simulation.objects import ball, box, colour, frame_at
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
+Pair = tuple[float, float]
+Piece = Callable[[Soup, np.random.Generator, FloatArray, float], None]
 
 WALL = 0.14  # thickness, metres
 DOOR_HEIGHT = 2.1
 KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
+WOODS = ((0.50, 0.34, 0.20), (0.68, 0.52, 0.34), (0.82, 0.80, 0.76), (0.30, 0.21, 0.15), (0.60, 0.42, 0.28))
+CLOTHS = ((0.25, 0.32, 0.45), (0.55, 0.30, 0.25), (0.42, 0.44, 0.42), (0.62, 0.56, 0.45), (0.24, 0.38, 0.32))
+PAINTS = ((0.70, 0.20, 0.16), (0.15, 0.35, 0.60), (0.85, 0.68, 0.20), (0.20, 0.48, 0.36), (0.85, 0.82, 0.76))
+_WALLS = ((0.86, 0.84, 0.79), (0.80, 0.82, 0.84), (0.78, 0.72, 0.60), (0.66, 0.72, 0.68), (0.74, 0.62, 0.56))
+_AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
+_DEEPEST = 0.65  # piece at a wall, metres
+_STEP = 0.5  # between the vertices of walls, which carry the light, metres
 
 
 @dataclass(frozen=True)
@@ -88,14 +97,6 @@ def draw_house(seed: int) -> House:
                 doors.append((before, middle, start, middle + 1.0))
             before, start = end, end + WALL
     return House(rooms, doors)
-
-
-WOODS = ((0.50, 0.34, 0.20), (0.68, 0.52, 0.34), (0.82, 0.80, 0.76), (0.30, 0.21, 0.15), (0.60, 0.42, 0.28))
-CLOTHS = ((0.25, 0.32, 0.45), (0.55, 0.30, 0.25), (0.42, 0.44, 0.42), (0.62, 0.56, 0.45), (0.24, 0.38, 0.32))
-PAINTS = ((0.70, 0.20, 0.16), (0.15, 0.35, 0.60), (0.85, 0.68, 0.20), (0.20, 0.48, 0.36), (0.85, 0.82, 0.76))
-
-Pair = tuple[float, float]
-Piece = Callable[[Soup, np.random.Generator, FloatArray, float], None]
 
 
 def solid(
@@ -266,12 +267,6 @@ STANDING: dict[str, tuple[tuple[Piece, float, float], ...]] = {  # piece, its wi
     "hall": ((rack, 2.4, 0.6), (cartons, 1.4, 0.6), (rack, 1.8, 0.6)),
 }
 TALL: tuple[Piece, ...] = (shelf, cupboard, counter, rack)  # hide what hangs on the wall
-
-
-_WALLS = ((0.86, 0.84, 0.79), (0.80, 0.82, 0.84), (0.78, 0.72, 0.60), (0.66, 0.72, 0.68), (0.74, 0.62, 0.56))
-_AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
-_DEEPEST = 0.65  # piece at a wall, metres
-_STEP = 0.5  # between the vertices of walls, which carry the light, metres
 
 
 class Interior:

@@ -20,6 +20,11 @@ _CLEAR_M = 0.44  # of a path's cells from walls and furniture, which begin up to
 _SMOOTH_CLEAR_M = 0.42  # of a path after its corners are rounded
 _PLACE_CLEAR_M = 0.55
 _CORNERS_M = (0.4, 0.25, 0.12)  # by how much corners are rounded, the first that keeps clear
+CLOCK = 120.0  # samples of a motion a second
+FASTEST_TURN_DEG = 17.0  # a frame
+_STRIDE_M = 0.72
+_SETTLED_S = 0.15  # over which turns and starts are smoothed
+_CARRIER_CLEAR_M = 0.4  # of the carrier in the plan, where nothing is swayed any further
 
 
 class Floor:
@@ -114,13 +119,6 @@ class Floor:
         return length, before
 
 
-CLOCK = 120.0  # samples of a motion a second
-FASTEST_TURN_DEG = 17.0  # a frame
-_STRIDE_M = 0.72
-_SETTLED_S = 0.15  # over which turns and starts are smoothed
-_CLEAR_M = 0.4  # of the carrier in the plan, where nothing is swayed any further
-
-
 @dataclass(frozen=True)
 class Gait:
     """How one kind of carrier moves."""
@@ -178,7 +176,7 @@ def carry(floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> 
     count = len(base)
     x, y, yaw, pitch = base.T
     step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
-    free = np.clip(floor.clearance(base[:, :2]) - _CLEAR_M, 0.0, 1.0)
+    free = np.clip(floor.clearance(base[:, :2]) - _CARRIER_CLEAR_M, 0.0, 1.0)
     side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
     side = np.clip(side, -free, free)
     unsteady = np.deg2rad(gait.tremor_deg)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.frames import Image, Intrinsics
 from slam.loops.verification import Loop
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.results.report.page import Picture
 
 _EXAMPLES, _MOST_LOOPS, _MOST_LINES = 5, 6, 60

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from slam.evaluation.drift import FIGURE_LENGTHS_M, aligned, segment_errors
+from slam.evaluation.trajectory import FIGURE_LENGTHS_M, aligned, segment_errors
 from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import Similarity, from_rotation_vector
 from slam.results.folder import RunFolder

@@ -6,9 +6,9 @@ import pytest
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
 from slam.mapping import filters, surface
-from slam.mapping.filters import DepthFilters, KeyframeDepth
+from slam.mapping.depth import DepthFilters, KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.mapping.tile_surface import TileSurface, with_holes_closed
+from slam.mapping.surface import TileSurface, with_holes_closed
 from slam.mapping.views import evened
 
 

@@ -8,7 +8,7 @@ from slam.frontend import drive
 from slam.frontend.drive import Keyframe
 from slam.geometry import se3
 from slam.mapping import filters, submap, surface
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slam.mapping import tile_surface
-from slam.mapping.tile_surface import extract_tile
+from slam.mapping.surface import extract_tile
 
 
 def test_the_order_of_vertices_in_one_place_is_that_of_their_triangles(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
-from slam.pipeline.keyframe_tracking import FrontEnd, choose
+from slam.pipeline.keyframe_maps import FrontEnd, choose
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch

@@ -18,8 +18,7 @@ from slam.loops.closure import LoopClosures, find_loops
 from slam.loops.consistency import Track
 from slam.loops.verification import Loop
 from slam.pipeline import map_closure
-from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.map_closure import MapClosure, close_maps
+from slam.pipeline.keyframe_maps import KeyframeTracking, MapClosure, close_maps
 from slam.sequences.catalogue import open_sequence
 
 CONFIG = SlamConfig()

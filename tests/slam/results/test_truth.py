@@ -16,7 +16,7 @@ from slam.config.sections import ScaleMode
 from slam.frames import Intrinsics, Sequence
 from slam.frontend.scale.metric_scale import LengthUnit, Scale, ScaleEstimate
 from slam.geometry.se3 import FloatArray, apply
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.results.metrics import MapMetrics
 from slam.results.truth import DepthQuality, find_truth, map_errors, projected, true_depth
 from slam.runtime.errors import SequenceError

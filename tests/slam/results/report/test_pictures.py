@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.verification import Loop
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.results.report.page import Picture
 from slam.results.report.pictures import DepthPictures, loop_pictures
 

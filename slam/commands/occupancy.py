@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from slam.formats.ply import Ply
 from slam.geometry.se3 import FloatArray
-from slam.mapping.views import moved_rows
+from slam.mapping.submap import moved_rows
 from slam.runtime.errors import RunError
 from slam.runtime.files import write_atomically
 

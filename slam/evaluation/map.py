@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, apply, nearest_rotation, path_distance
-from slam.mapping.views import moved_rows
+from slam.mapping.submap import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part

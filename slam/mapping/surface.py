@@ -24,8 +24,7 @@ from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
-from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, Keys, MergedSubmaps, SpilledSubmap, new_grid
-from slam.mapping.views import Painter
+from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, Keys, MergedSubmaps, Painter, SpilledSubmap, new_grid
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.spill import SpilledArray, SpillFile
@@ -138,7 +137,10 @@ class MapSurface:
             patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
             if patch is not None:
                 if config.close_holes_m > 0:
-                    up = _upwards(submaps, tile, config.voxel_size_m)
+                    # upwards in the camera of the view nearest to the tile
+                    middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * config.voxel_size_m
+                    nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
+                    up = -submaps.T_world_views[nearest, :3, 1]
                     patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
                 if patch.own.any():
                     self._pieces.append(_piece(patch, painter, self._spill))
@@ -204,14 +206,6 @@ def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> li
         rows.append(_Rows(spill.put(numbers), written, int(piece.sizes[kept_part[first:last]].sum())))
         place, written = place + len(groups), written + count
     return rows
-
-
-def _upwards(submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float) -> FloatArray:
-    """Upwards ``(3,)`` in the camera of the view nearest to a tile."""
-    middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * voxel_size_m
-    nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
-    up: FloatArray = -submaps.T_world_views[nearest, :3, 1]
-    return up
 
 
 @dataclass(frozen=True)
@@ -363,7 +357,13 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]
     following[begin] = end
     chosen = begin[~broken[label[begin]]]
     _, first = np.unique(label[chosen], return_index=True)
-    return [_walk(following, int(start)) for start in chosen[np.sort(first)]]
+    rings = []
+    for start in chosen[np.sort(first)].tolist():
+        ring = [start]
+        while (vertex := int(following[ring[-1]])) != start:
+            ring.append(vertex)
+        rings.append(np.array(ring, dtype=np.int64))
+    return rings
 
 
 def _open_edges(triangles: Triangles, vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -380,10 +380,3 @@ def _open_edges(triangles: Triangles, vertices: int) -> tuple[NDArray[np.int64],
 
 def _once(ends: NDArray[np.int64], vertices: int) -> Mask:
     return np.asarray(np.bincount(ends, minlength=vertices) == 1)
-
-
-def _walk(following: NDArray[np.int64], start: int) -> NDArray[np.int64]:
-    ring = [start]
-    while (vertex := int(following[ring[-1]])) != start:
-        ring.append(vertex)
-    return np.array(ring, dtype=np.int64)

@@ -29,7 +29,7 @@ from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
 from slam.mapping.depth import DepthRefiner, KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.mapping.views import moved_rows
+from slam.mapping.submap import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.timing import Stopwatch
 

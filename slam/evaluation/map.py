@@ -109,14 +109,6 @@ def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices
     return [parts[k] for k in chosen]
 
 
-def nearby(T_world_camera: FloatArray, views: Indices, part: Indices) -> Indices:
-    """The ``views`` that can see surfaces near a stretch of road."""
-    positions = T_world_camera[:, :3, 3]
-    away, _ = cKDTree(positions[part]).query(positions[views])
-    near: Indices = views[away <= 2 * RANGE_M]
-    return near
-
-
 def accumulated(truth: SurfaceTruth, views: Indices, positions: FloatArray) -> Surface:
     """The surface from all ``views``, one point in each voxel of 5 cm, one in an image where there is one.
 
@@ -243,7 +235,9 @@ def compare(
     nearest = {name: cameras.query(points, distance_upper_bound=RANGE_M) for name, points in maps.items()}
     found: dict[str, list[tuple[NDArray[Any], ...]]] = {name: [] for name in maps}
     for stretch in parts:
-        near = nearby(T_world_camera, views, stretch)
+        positions = T_world_camera[:, :3, 3]
+        away_from_stretch, _ = cKDTree(positions[stretch]).query(positions[views])
+        near = views[away_from_stretch <= 2 * RANGE_M]  # the views that can see surfaces near the stretch
         to_surface, on_surface, surface_range = _surface_along(truth, near, T_world_camera, cameras, stretch)
         for name, points in maps.items():
             away, camera = nearest[name]

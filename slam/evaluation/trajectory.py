@@ -239,8 +239,11 @@ def trajectory_metrics(
     without_ate = None
     if _stands_still(T_world_reference):
         without_ate = _REFERENCE_STANDS_STILL
-    elif snippet5 is None and _goes_backwards(predicted, true):
-        without_ate = _BACKWARDS
+    elif snippet5 is None:
+        # snippets that point against the true ones, which a negative scale would take for a good fit
+        p, g = predicted[..., :3, 3], true[..., :3, 3]
+        if (g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()):
+            without_ate = _BACKWARDS
     if snippet5 is None and len(predicted):
         snippet5 = snippet_errors(predicted, true)
     return TrajectoryMetrics(
@@ -353,12 +356,6 @@ def _alignment_metrics(
     if not isinstance(aligned.scale, Failed) and aligned.scale <= 0:
         return AlignedMetrics.unknown(_BACKWARDS.reason)
     return AlignedMetrics.of(**{name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()})
-
-
-def _goes_backwards(predicted: FloatArray, truth: FloatArray) -> bool:
-    """Whether snippets point against the true ones, which a negative scale would take for a good fit."""
-    p, g = predicted[..., :3, 3], truth[..., :3, 3]
-    return bool((g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()))
 
 
 def _snippet_metrics(errors: SnippetErrors | None, without_ate: Failed | None = None) -> SnippetMetrics:

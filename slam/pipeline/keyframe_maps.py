@@ -231,10 +231,7 @@ class _Rows:
         counts = [len(segment.map.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
         self.T_map_camera = np.concatenate([segment.map.T_world_camera for segment in maps])
-        self.track = self._track(poses)
-
-    def _track(self, poses: KeyframePoses) -> Track:
-        """Where odometry has the keyframes: parts of a map are related by the motions between them."""
+        # where odometry has the keyframes: parts of a map are related by the motions between them
         frames = np.array([keyframe.index for keyframe in self.keyframes], np.intp)
         alone = zip(frames.tolist(), (-1 - self.maps).tolist(), strict=True)
         worlds = np.array([poses.component.get(frame, world) for frame, world in alone], np.intp)
@@ -246,7 +243,7 @@ class _Rows:
             if poses.segments[pose.from_index] != poses.segments.get(pose.to_index):
                 unsure = _TURN_SIGMAS * float(np.linalg.norm(pose.sigmas[3:]))
                 path[frames >= pose.to_index] += unsure / OF_KEYFRAMES.max_drift_ratio
-        return Track(T, path, frames, self.maps, worlds)
+        self.track = Track(T, path, frames, self.maps, worlds)
 
     def of(self, loop: Loop) -> tuple[int, int]:
         """Rows of the keyframes of a loop."""
@@ -330,23 +327,17 @@ def _joined(
     chosen = np.flatnonzero(np.isin(rows.maps, members))
     place = np.full(len(rows.keyframes), -1)
     place[chosen] = np.arange(len(chosen))
-    edges, shared = _steps(rows, chosen), []
+    edges, shared = [], []
+    for first, row in enumerate(chosen):  # between neighbouring keyframes of one map, whose unit hardly changes
+        for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
+            if rows.maps[row] == rows.maps[chosen[last]]:
+                T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
+                length = _RELATIVE_SIGMA * float(np.linalg.norm(T_step[:3, 3])) + _LEAST_SIGMA
+                sigmas = np.concatenate([np.full(3, _ROTATION_SIGMA), np.full(3, length), [_SCALE_SIGMA]])
+                edges.append(RelativeSimilarity(first, last, T_step, 1.0, sigmas))
     for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
         sigmas = np.append(loop.measured.sigmas, _LOOP_SCALE_SIGMA)
         edges.append(RelativeSimilarity(earlier, later, loop.measured.T_from_to, loop.scale, sigmas))
         shared.append((earlier, later, loop.corners))
     T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
     return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)
-
-
-def _steps(rows: _Rows, chosen: NDArray[np.intp]) -> list[RelativeSimilarity]:
-    """Between neighbouring keyframes of one map, whose unit hardly changes."""
-    edges = []
-    for first, row in enumerate(chosen):
-        for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
-            if rows.maps[row] == rows.maps[chosen[last]]:
-                T = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
-                length = _RELATIVE_SIGMA * float(np.linalg.norm(T[:3, 3])) + _LEAST_SIGMA
-                sigmas = np.concatenate([np.full(3, _ROTATION_SIGMA), np.full(3, length), [_SCALE_SIGMA]])
-                edges.append(RelativeSimilarity(first, last, T, 1.0, sigmas))
-    return edges

@@ -162,7 +162,7 @@ def _illuminated(seed: int, some_are_dim: bool) -> Float32Array:
         strength = np.exp(np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(interior.house.rooms)))
         for room, factor in zip(interior.house.rooms, strength):
             lights[room.contains(lights[:, :2]), 3] *= factor
-    return illuminate(Surface.of(interior.mesh), lights)
+    return illuminate(Surface(interior.mesh), lights)
 
 
 def _standing(walk: Carried, seconds: float) -> FloatArray:

@@ -251,7 +251,14 @@ def _layout(
         rng = np.random.default_rng([seed, 0])
         cycle = loop_cycle(rng, edges)
         plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35, kind=kind)
-        lane_plan = _loop_lane(plan, seed)
+        # around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is revisited
+        first, second = plan.node(plan.drive[0]), plan.node(plan.drive[1])
+        lane_plan = _lane(plan, seed)[int(0.5 * float(np.linalg.norm(second - first)) / STEP) :]
+        away = np.linalg.norm(lane_plan - lane_plan[0], axis=1)
+        met = int(60.0 / STEP)
+        met += int(np.argmax(away[met:] < 2.0))
+        met += int(np.argmin(away[met : met + int(8.0 / STEP)]))
+        lane_plan = lane_plan[: met + int(OVERLAP / STEP) + 1]
         stretch = (moving - 1.0) / _arrival(bend, lane_plan, stops, moving)[-1]
         if abs(stretch - 1.0) < 0.004:
             break
@@ -262,17 +269,6 @@ def _layout(
 def _lane_offset(plan: StreetPlan, seed: int) -> float:
     """How far right of the middle of the street the car drives, metres."""
     return float(np.random.default_rng([seed, 4]).uniform(0.33, 0.38)) * plan.half_width
-
-
-def _loop_lane(plan: StreetPlan, seed: int) -> FloatArray:
-    """Lane around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is revisited."""
-    first, second = plan.node(plan.drive[0]), plan.node(plan.drive[1])
-    lane = _lane(plan, seed)[int(0.5 * float(np.linalg.norm(second - first)) / STEP) :]
-    away = np.linalg.norm(lane - lane[0], axis=1)
-    met = int(60.0 / STEP)
-    met += int(np.argmax(away[met:] < 2.0))
-    met += int(np.argmin(away[met : met + int(8.0 / STEP)]))
-    return lane[: met + int(OVERLAP / STEP) + 1]
 
 
 def _lane(plan: StreetPlan, seed: int) -> FloatArray:
@@ -365,7 +361,12 @@ def _poses(
     right -= (right * forward).sum(axis=1, keepdims=True) * forward
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
-    suspension = _suspension(rng, len(at))
+    # suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in time, (N, 4)
+    white = rng.standard_normal((len(at) + 60, 4))
+    slow, fast = (gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0))
+    mixed = (0.8 * slow + 0.6 * fast)[30:-30]
+    sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
+    suspension = np.clip(mixed, -2.2, 2.2) * sizes
     if variety is None:
         suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
     else:
@@ -373,12 +374,3 @@ def _poses(
     position = bend(at) - (height_m + suspension[:, 3:]) * down
     T_street_level = se3.make(np.stack([right, down, forward], axis=2), position)
     return T_street_level @ se3.from_rotation_vector(suspension[:, :3], np.zeros((len(at), 3)))
-
-
-def _suspension(rng: np.random.Generator, frames: int) -> FloatArray:
-    """Suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in time, ``(N, 4)``."""
-    white = rng.standard_normal((frames + 60, 4))
-    slow, fast = (gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0))
-    mixed = (0.8 * slow + 0.6 * fast)[30:-30]
-    sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
-    return np.asarray(np.clip(mixed, -2.2, 2.2) * sizes)

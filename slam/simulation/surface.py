@@ -14,17 +14,11 @@ from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
 from slam.simulation.texture import SHADERS, Texels, fractal
 
 
-@dataclass(frozen=True)
 class Surface:
     """A mesh and its ray casting scene."""
 
-    mesh: Mesh
-    scene: Any
-
-    @classmethod
-    def of(cls, mesh: Mesh) -> "Surface":
-        """The surface of a mesh."""
-        return cls(mesh, scene_of(mesh.vertices, mesh.triangles))
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh, self.scene = mesh, scene_of(mesh.vertices, mesh.triangles)
 
     def cast(self, rays: Float32Array) -> dict[str, NDArray[Any]]:
         """Where rays ``(N, 6)`` meet it: ``t_hit`` (infinite if nowhere), triangle and barycentric weights."""

@@ -121,11 +121,11 @@ class SimulatedWorld(ABC):
 
     @functools.cached_property
     def _still(self) -> Surface:
-        return Surface.of(self._build())
+        return Surface(self._build())
 
     def _surfaces(self, index: int) -> list[Surface]:
         """The surfaces at a frame: what stands still, and what moves."""
-        return [self._still, *map(Surface.of, self._moving(index))]
+        return [self._still, *map(Surface, self._moving(index))]
 
     def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or from one of each row."""

@@ -26,7 +26,7 @@ from slam.mapping.submap import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.storage.record import Count, Record, part
-from slam.simulation.surface import scene_of
+from slam.simulation.world import scene_of
 
 Indices = NDArray[np.int64]
 

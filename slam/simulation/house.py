@@ -295,12 +295,24 @@ class Interior:
 
     def _enclose_and_fill(self, room: Room) -> None:
         """Everything inside the walls of a room."""
-        x0, y0, x1, y1 = room.area
+        rng, (x0, y0, x1, y1) = self.rng, room.area
         east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
-        self._panel(np.array([x0, y0, 0.0]), east, north, self._floor(room))
-        ceiling = self.soup.instance(Material.PLASTER, colour(self.rng, (0.88, 0.88, 0.86), spread=0.02))
+        if room.kind in ("living", "bedroom", "office"):
+            floor = self.soup.instance(Material.BOARDS, colour(rng, *WOODS), None, (rng.uniform(0.07, 0.16),))
+        else:
+            side = float(rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5))
+            tone = colour(rng, (0.62, 0.60, 0.57), (0.50, 0.51, 0.53), (0.68, 0.58, 0.46))
+            chequered = float(room.kind in ("bath", "kitchen") and rng.random() < 0.4)
+            floor = self.soup.instance(Material.TILES, tone, 0.75 * tone, (side, 0.008, chequered))
+        self._panel(np.array([x0, y0, 0.0]), east, north, floor)
+        ceiling = self.soup.instance(Material.PLASTER, colour(rng, (0.88, 0.88, 0.86), spread=0.02))
         self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
-        wall = self._wall(room)
+        tone = colour(rng, *_WALLS, spread=0.04)
+        if room.kind == "bath":
+            wall = self.soup.instance(Material.TILES, tone, 0.8 * tone, (float(rng.uniform(0.1, 0.25)), 0.006))
+        else:
+            papered = float(rng.uniform(0.1, 0.3)) if rng.random() < 0.2 else 0.0
+            wall = self.soup.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
         for number in range(4):
             self._enclose(room, number, wall)
             self._furnish(room, number)
@@ -319,23 +331,6 @@ class Interior:
         lintel, threshold = (corner + up, north, east), (corner, east, north)
         for quad in (*((foot, along, up) for foot, along in jambs), lintel, threshold):
             self.soup.quad(*quad, self.frame_look)
-
-    def _floor(self, room: Room) -> int:
-        rng = self.rng
-        if room.kind in ("living", "bedroom", "office"):
-            return self.soup.instance(Material.BOARDS, colour(rng, *WOODS), None, (rng.uniform(0.07, 0.16),))
-        side = float(rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5))
-        tone = colour(rng, (0.62, 0.60, 0.57), (0.50, 0.51, 0.53), (0.68, 0.58, 0.46))
-        chequered = float(room.kind in ("bath", "kitchen") and rng.random() < 0.4)
-        return self.soup.instance(Material.TILES, tone, 0.75 * tone, (side, 0.008, chequered))
-
-    def _wall(self, room: Room) -> int:
-        rng = self.rng
-        tone = colour(rng, *_WALLS, spread=0.04)
-        if room.kind == "bath":
-            return self.soup.instance(Material.TILES, tone, 0.8 * tone, (float(rng.uniform(0.1, 0.25)), 0.006))
-        papered = float(rng.uniform(0.1, 0.3)) if rng.random() < 0.2 else 0.0
-        return self.soup.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
 
     def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
         """A parallelogram with vertices at most ``_STEP`` apart, textured in metres from its corner."""

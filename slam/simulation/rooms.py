@@ -13,9 +13,8 @@ from slam.simulation.house import Interior
 from slam.simulation.motion import Carried, Floor, carry
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
-from slam.simulation.surface import Hits, Surface, place_rays, unlit
 from slam.simulation.texture import GLOWING
-from slam.simulation.world import SHUTTER, SimulatedWorld, in_bytes, square_camera, through_lens
+from slam.simulation.world import SHUTTER, Hits, SimulatedWorld, Surface, place_rays, square_camera, through_lens
 
 STILL_S = 3.0
 _USUAL_FOV_DEG, _VARIED_FOV_DEG = 65.0, (55.0, 100.0)
@@ -95,7 +94,7 @@ class SimulatedRooms(SimulatedWorld):
     def _shade(
         self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
     ) -> Float32Array:
-        rgb = unlit(surfaces[number].mesh, hits, self.camera.fx)
+        rgb = surfaces[number].unlit(hits, self.camera.fx)
         if number > 0:  # people are as bright as what is below them
             down = rays.copy()
             down[:, :3] += rays[:, 3:] * hits.depth[:, None]
@@ -112,14 +111,14 @@ class SimulatedRooms(SimulatedWorld):
         glow = _GLOW[np.take(self._still.mesh.material, triangle)]
         return np.asarray(np.where(glow > 0.0, glow, light))
 
-    def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
-        """Gain, lens blur, noise, and quantisation to 8 bits."""
+    def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
+        """Gain, lens blur and noise."""
         gain = self._gain(index)
         rgb = through_lens(rgb * np.float32(gain))
         if "exposure" in self.options.hazards:
             rng = np.random.default_rng([self.options.seed, 56, index])
             rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(0.008 * np.sqrt(gain))
-        return in_bytes(rgb)
+        return rgb
 
     def _gain(self, index: int) -> float:
         """Of the sensor: the world's own, or one that follows the light of the last second."""
@@ -155,29 +154,17 @@ _METER_WEIGHT = float(np.exp(-_METER_S * np.arange(_METERED) / 0.35).sum())
 
 @functools.lru_cache(maxsize=2)
 def _illuminated(seed: int, some_are_dim: bool) -> Float32Array:
-    """Irradiance in a house, some rooms of which may be dim."""
+    """Irradiance in a house, some rooms of which may be dim.
+
+    It is that at the corners of triangles, about 1 below a lamp, ``(3, T)``; they face the side that is seen.
+    """
     interior = _interior(seed)
     lights = interior.lights.copy()
     if some_are_dim:
         strength = np.exp(np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(interior.house.rooms)))
         for room, factor in zip(interior.house.rooms, strength):
             lights[room.contains(lights[:, :2]), 3] *= factor
-    return illuminate(Surface(interior.mesh), lights)
-
-
-def _standing(walk: Carried, seconds: float) -> FloatArray:
-    """``T_scene_person`` of whoever walks so, upright on the floor."""
-    x, y, _, yaw, _, _ = walk.at(np.array([seconds]))[:, 0]
-    c, s = np.cos(yaw), np.sin(yaw)
-    return se3.make(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, -0.1]))
-
-
-def illuminate(surface: Surface, lights: FloatArray) -> Float32Array:
-    """Irradiance at the corners of triangles, about 1 below a lamp, ``(3, T)``.
-
-    ``lights`` ``(L, 4)`` are positions and strengths; triangles face the side that is seen.
-    """
-    mesh = surface.mesh
+    surface, mesh = Surface(interior.mesh), interior.mesh
     triangles = mesh.triangles.astype(np.int64)
     count = len(mesh.vertices)
     middle, normal = np.zeros((count, 3)), np.zeros((count, 3))
@@ -197,6 +184,13 @@ def illuminate(surface: Surface, lights: FloatArray) -> Float32Array:
         thrown = np.append(thrown, 0.0)  # for rays that meet nothing
         total = direct + thrown[hit].mean(axis=0)
     return np.ascontiguousarray(total[triangles].T, dtype=np.float32)
+
+
+def _standing(walk: Carried, seconds: float) -> FloatArray:
+    """``T_scene_person`` of whoever walks so, upright on the floor."""
+    x, y, _, yaw, _, _ = walk.at(np.array([seconds]))[:, 0]
+    c, s = np.cos(yaw), np.sin(yaw)
+    return se3.make(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, -0.1]))
 
 
 def _direct(surface: Surface, points: FloatArray, normals: FloatArray, lights: FloatArray) -> FloatArray:

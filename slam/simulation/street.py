@@ -1,9 +1,10 @@
-"""An embedded street world: images, exact depth, exact poses and LiDAR scans of a simulated drive, and its hazards.
+"""An embedded street world: images, exact depth, exact poses and LiDAR scans of a drive under a sky, with hazards.
 
 Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/simulation``).
 """
 
 import functools
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,9 +18,9 @@ from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
 from slam.simulation.objects import bonnet, car, frame_at
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
-from slam.simulation.surface import Hits, Surface, draw_varied_weather, draw_weather, paint, place_rays, sky
+from slam.simulation.texture import Texels, fractal
 from slam.simulation.town import build_town
-from slam.simulation.world import SHUTTER, SimulatedWorld, in_bytes, square_camera, through_lens
+from slam.simulation.world import SHUTTER, Hits, SimulatedWorld, Surface, place_rays, square_camera, through_lens
 
 # KITTI odometry 00-02 (rectified colour camera), at the size it was recorded at
 KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
@@ -128,10 +129,10 @@ class SimulatedStreet(SimulatedWorld):
         lit[pixels[towards]] = 1.0 - shadow
         soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))  # over neighbouring pixels
         lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
-        return paint(surfaces[number].mesh, hits, lit, self._weather, self.camera.fx)
+        return paint(surfaces[number], hits, lit, self._weather, self.camera.fx)
 
-    def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
-        """Rain, lens blur, exposure, and quantisation to 8 bits."""
+    def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
+        """Rain, lens blur and exposure."""
         rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
             rgb = rained_on(rgb, self.options.seed, index)
@@ -141,7 +142,7 @@ class SimulatedStreet(SimulatedWorld):
             rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
         if self._variety is not None:
             rgb = sensed(rgb, self._variety.vignette, self._variety.noise, self.options.seed, index)
-        return in_bytes(rgb)
+        return rgb
 
 
 def beam_directions(rng: np.random.Generator) -> Float32Array:
@@ -206,6 +207,102 @@ def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
     fraction *= SHUTTER / (high - low)
     T_here_shutter = se3.from_rotation_vector(fraction[:, None] * turn, fraction[:, None] * T_low_high[:3, 3])
     return np.asarray(here @ T_here_shutter)
+
+
+@dataclass(frozen=True)
+class Weather:
+    """How a world is lit."""
+
+    sun: Float32Array  # unit direction towards the sun, street frame, (3,)
+    sunshine: float  # strength of the direct light, 0 overcast
+    ambient: float  # strength of the light from everywhere
+    zenith: Float32Array  # colour of the sky overhead, (3,)
+    horizon: Float32Array  # colour of the sky low down, and of the haze, (3,)
+    clouds: float  # cover, 0 to 1
+    visibility_m: float  # distance at which the haze has taken 63 %
+    exposure: float | None  # gain of the camera; None sets it so that a share of the pixels saturates
+    saturated: float = 0.0  # that share
+    contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
+
+
+def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatArray:
+    """Its direction at an elevation in radians, ``(3,)``."""
+    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lowest, highest)
+    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.array(sun)
+
+
+def draw_weather(seed: int) -> Weather:
+    """Weather of a world."""
+    rng = np.random.default_rng([seed, 20])
+    sun = _draw_sun(rng, 0.5, 1.1)
+    sunshine = float(rng.uniform(0.25, 0.75))
+    return Weather(
+        sun=sun.astype(np.float32),
+        sunshine=sunshine,
+        ambient=0.95 - 0.6 * sunshine,
+        zenith=(np.array([0.38, 0.56, 0.85]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
+        horizon=(np.array([0.80, 0.84, 0.88]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
+        clouds=float(rng.uniform(0.0, 1.0)),
+        visibility_m=float(rng.uniform(220.0, 600.0)),
+        exposure=float(rng.uniform(0.95, 1.2)),
+    )
+
+
+def draw_varied_weather(seed: int) -> Weather:
+    """Weather of a varied world: three in four have a sun beside which shadows are 3 to 10 times as dark."""
+    rng = np.random.default_rng([seed, 21])
+    sun = _draw_sun(rng, 0.3, 1.15)
+    sunny = rng.random() < 0.75
+    ambient = 1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0)))) if sunny else float(rng.uniform(0.6, 0.95))
+    bright = float(rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4))
+    blue = np.array([0.30, 0.52, 0.85]) + rng.uniform(-0.08, 0.08, 3)
+    return Weather(
+        sun=sun.astype(np.float32),
+        sunshine=(1.0 - ambient) / sun[2],  # a level road has 1 in the sun
+        ambient=ambient,
+        zenith=(bright * blue).astype(np.float32),
+        horizon=(bright * (np.array([0.80, 0.86, 0.92]) + rng.uniform(-0.08, 0.08, 3))).astype(np.float32),
+        clouds=float(rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0)),
+        visibility_m=float(rng.uniform(300.0, 1500.0)),
+        exposure=None,
+        saturated=float(rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04)),
+        contrast=float(rng.uniform(1.2, 3.0)),
+    )
+
+
+def sky(weather: Weather, directions: Float32Array) -> Float32Array:
+    """Colour of the sky along unit ``directions`` in the street frame, ``(3, N)`` both."""
+    up = np.clip(directions[2], 0.0, 1.0)
+    rgb = weather.horizon[:, None] + np.sqrt(up) * (weather.zenith - weather.horizon)[:, None]
+    plane = directions[:2] / (up + 0.12)
+    still = np.zeros_like(up)
+    size = 0.006 / (up + 0.12)
+    texels = Texels(plane[0], plane[1], size, size, still, still)
+    cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
+    fraction = np.clip(1.6 * cover, 0.0, 0.85)
+    white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
+    return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
+
+
+def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32Array:
+    """Irradiance ``(3, N)`` on surfaces of unit normals ``(3, N)`` towards the viewer; ``lit`` is 1 in the sun."""
+    direct = weather.sunshine * np.clip(weather.sun @ normals, 0.0, 1.0) * lit
+    around = weather.ambient * (0.78 + 0.22 * normals[2])
+    warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
+    cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
+    return np.asarray(direct * warm + around * cool, dtype=np.float32)
+
+
+def paint(surface: Surface, hits: Hits, lit: Float32Array, weather: Weather, focal_px: float) -> Float32Array:
+    """Colour ``(3, N)`` of each hit on a mesh in the open; ``lit`` ``(N,)`` is 1 where the sun is seen."""
+    rgb, mesh = surface.unlit(hits, focal_px), surface.mesh
+    if weather.contrast != 1.0:
+        base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
+        rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
+    rgb *= light(weather, hits.normals, lit)
+    haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+    return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
 
 
 class Traffic:

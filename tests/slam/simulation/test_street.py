@@ -13,7 +13,7 @@ from slam.simulation.geometry import FLAT, Material, Soup
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.street import SimulatedStreet
-from slam.simulation.surface import Surface, place_rays
+from slam.simulation.world import Surface, place_rays
 
 SMALL = {"width": 208, "height": 64}
 

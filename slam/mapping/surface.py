@@ -343,7 +343,7 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]
     """
     vertices = len(upwards)
     begin, end = _open_edges(triangles, vertices)
-    simple = _once(begin, vertices) & _once(end, vertices)
+    simple = (np.bincount(begin, minlength=vertices) == 1) & (np.bincount(end, minlength=vertices) == 1)
     link = coo_array((np.ones(len(begin), dtype=bool), (begin, end)), shape=(vertices, vertices))
     _, label = connected_components(link, directed=False)
     broken = np.zeros(vertices, dtype=bool)  # rings that touch themselves
@@ -376,7 +376,3 @@ def _open_edges(triangles: Triangles, vertices: int) -> tuple[NDArray[np.int64],
     low, high = np.divmod(codes // 2, vertices)
     is_down = codes % 2 == 1
     return np.where(is_down, high, low), np.where(is_down, low, high)
-
-
-def _once(ends: NDArray[np.int64], vertices: int) -> Mask:
-    return np.asarray(np.bincount(ends, minlength=vertices) == 1)

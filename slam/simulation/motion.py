@@ -145,16 +145,39 @@ GAITS: dict[str, Gait] = {
 assert tuple(GAITS) == get_args(Motion)
 
 
-@dataclass(frozen=True)
 class Carried:
-    """A motion, ``CLOCK`` samples a second."""
+    """A motion, ``CLOCK`` samples a second.
 
-    channels: FloatArray  # x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians, (M, 6)
+    Its channels are x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians.
+    """
+
+    def __init__(self, floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> None:
+        """A motion of so many seconds for a camera of ``rate`` frames a second."""
+        rng, gait = np.random.default_rng([seed, 53, *motion.encode()]), GAITS[motion]
+        turn = np.deg2rad(min(gait.turn_deg, 0.9 * FASTEST_TURN_DEG * rate))
+        base, moved = _Walk(floor, gait, turn, rng).over(int(np.ceil(seconds * CLOCK)) + 2)
+        base = gaussian_filter1d(base, _SETTLED_S * CLOCK, axis=0, mode="nearest")
+        moved = gaussian_filter1d(moved, _SETTLED_S * CLOCK, mode="nearest")
+        count = len(base)
+        x, y, yaw, pitch = base.T
+        step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
+        free = np.clip(floor.clearance(base[:, :2]) - _CARRIER_CLEAR_M, 0.0, 1.0)
+        side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
+        side = np.clip(side, -free, free)
+        unsteady = np.deg2rad(gait.tremor_deg)
+        wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
+        tremors = [unsteady * (_unrest(rng, count, 0.05) + 0.7 * _unrest(rng, count, 0.25)) for _ in range(3)]
+        height = rng.uniform(*gait.height_m) + gait.climb_m * _unrest(rng, count, 1.5)
+        z = height + moved * gait.bob_m * np.cos(step)
+        yaw = yaw + wander * _unrest(rng, count, 0.9) + tremors[0]
+        pitch = pitch + np.deg2rad(gait.pitch_deg) + wander / 3.0 * _unrest(rng, count, 0.9) + tremors[1]
+        roll = 4.0 * unsteady * _unrest(rng, count, 0.8) + 0.3 * moved * gait.sway_m * np.cos(0.5 * step) + tremors[2]
+        self._channels = np.stack([x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, pitch, roll], axis=1)
 
     def at(self, seconds: FloatArray) -> FloatArray:
         """The channels at times ``(N,)``, ``(6, N)``."""
-        clock = np.arange(len(self.channels)) / CLOCK
-        return np.stack([np.interp(seconds, clock, channel) for channel in self.channels.T])
+        clock = np.arange(len(self._channels)) / CLOCK
+        return np.stack([np.interp(seconds, clock, channel) for channel in self._channels.T])
 
     def poses(self, seconds: FloatArray) -> FloatArray:
         """``T_scene_camera`` at times ``(N,)``, ``(N, 4, 4)``."""
@@ -164,30 +187,6 @@ class Carried:
         right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
         upright = se3.make(np.stack([right, np.cross(forward, right), forward], axis=2), np.stack([x, y, z], axis=1))
         return upright @ se3.from_rotation_vector(np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3)))
-
-
-def carry(floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> Carried:
-    """A motion of so many seconds for a camera of ``rate`` frames a second."""
-    rng, gait = np.random.default_rng([seed, 53, *motion.encode()]), GAITS[motion]
-    turn = np.deg2rad(min(gait.turn_deg, 0.9 * FASTEST_TURN_DEG * rate))
-    base, moved = _Walk(floor, gait, turn, rng).over(int(np.ceil(seconds * CLOCK)) + 2)
-    base = gaussian_filter1d(base, _SETTLED_S * CLOCK, axis=0, mode="nearest")
-    moved = gaussian_filter1d(moved, _SETTLED_S * CLOCK, mode="nearest")
-    count = len(base)
-    x, y, yaw, pitch = base.T
-    step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
-    free = np.clip(floor.clearance(base[:, :2]) - _CARRIER_CLEAR_M, 0.0, 1.0)
-    side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
-    side = np.clip(side, -free, free)
-    unsteady = np.deg2rad(gait.tremor_deg)
-    wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
-    tremors = [unsteady * (_unrest(rng, count, 0.05) + 0.7 * _unrest(rng, count, 0.25)) for _ in range(3)]
-    height = rng.uniform(*gait.height_m) + gait.climb_m * _unrest(rng, count, 1.5)
-    z = height + moved * gait.bob_m * np.cos(step)
-    yaw = yaw + wander * _unrest(rng, count, 0.9) + tremors[0]
-    pitch = pitch + np.deg2rad(gait.pitch_deg) + wander / 3.0 * _unrest(rng, count, 0.9) + tremors[1]
-    roll = 4.0 * unsteady * _unrest(rng, count, 0.8) + 0.3 * moved * gait.sway_m * np.cos(0.5 * step) + tremors[2]
-    return Carried(np.stack([x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, pitch, roll], axis=1))
 
 
 def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:

@@ -10,7 +10,7 @@ from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, IntArray, Material, Mesh, Moving
 from slam.simulation.house import Interior
-from slam.simulation.motion import Carried, Floor, carry
+from slam.simulation.motion import Carried, Floor
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
 from slam.simulation.texture import GLOWING
@@ -38,8 +38,10 @@ class SimulatedRooms(SimulatedWorld):
         floor = Floor(self._interior, options.seed)
         seconds = options.frames / options.rate + _AHEAD_S + 1.0
         motions = _PEOPLE if "people" in options.hazards else 1
-        self._carried = carry(floor, options.motion or "walk", seconds, options.rate, options.seed)
-        self._walks = [carry(floor, "walk", seconds, options.rate, options.seed + 1000 * k) for k in range(1, motions)]
+        self._carried = Carried(floor, options.motion or "walk", seconds, options.rate, options.seed)
+        self._walks = [
+            Carried(floor, "walk", seconds, options.rate, options.seed + 1000 * k) for k in range(1, motions)
+        ]
         rng = np.random.default_rng([options.seed, 57])
         crowd = [lambda soup: person(soup, rng, 0.0, 0.0)] * _PEOPLE  # around their own origins, looking along x
         self._people = Moving(rng, crowd) if "people" in options.hazards else None

@@ -18,6 +18,14 @@ from slam.simulation.options import StreetKind, Variety
 Node = tuple[int, int]
 BoolArray = NDArray[np.bool_]
 
+STEP = 0.25  # between samples of a path in the plan, metres
+OVERLAP = 67.0  # length of the start that a loop drives again, metres
+START = 25.0  # of a lone road, so that there is something behind the camera, metres
+CRUISE = 1.1  # metres per frame
+SLOWEST = 0.5  # metres per frame, except around a stop
+LATERAL_ACCELERATION = 0.045  # in corners, metres per frame squared (4.5 m/s^2)
+ACCELERATION = 0.022  # along the road, metres per frame squared
+FEWEST_LOOP_FRAMES = 250
 MARGIN = 42.0  # depth of the outermost lots, metres
 SMALLEST_BLOCK = 22.0  # between two street centres, metres
 _ROADS: dict[StreetKind, tuple[float, float, float, tuple[float, float]]] = {  # blocks, side streets, half width
@@ -64,7 +72,11 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
             dx, dy = ((1, 0), (-1, 0), (0, 1), (0, -1))[rng.integers(4)]
             cells.add((x + dx, y + dy))
         cycle = _trace(outline) if len(outline) == edges else None
-        if cycle is None or len({_turn(cycle, k) for k in range(edges)}) < 3:
+        if cycle is None:
+            continue
+        steps = np.diff([*cycle, *cycle[:2]], axis=0)
+        turns = np.sign(steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0])  # 1 left, -1 right, 0 straight on
+        if len(np.unique(turns)) < 3:
             continue
         low = np.min(cycle, axis=0)
         nodes = [(int(x - low[0]), int(y - low[1])) for x, y in cycle]
@@ -163,23 +175,6 @@ def _trace(outline: dict[tuple[Node, Node], None]) -> list[Node] | None:
     while (node := following[cycle[-1]]) != first:
         cycle.append(node)
     return cycle if len(cycle) == len(outline) else None
-
-
-def _turn(cycle: list[Node], k: int) -> int:
-    """Sign of the turn at the k-th node: 1 left, -1 right, 0 straight on."""
-    before, here, after = np.array(cycle[k - 1]), np.array(cycle[k]), np.array(cycle[(k + 1) % len(cycle)])
-    a, b = here - before, after - here
-    return int(np.sign(a[0] * b[1] - a[1] * b[0]))
-
-
-STEP = 0.25  # between samples of a path in the plan, metres
-OVERLAP = 67.0  # length of the start that a loop drives again, metres
-START = 25.0  # of a lone road, so that there is something behind the camera, metres
-CRUISE = 1.1  # metres per frame
-SLOWEST = 0.5  # metres per frame, except around a stop
-LATERAL_ACCELERATION = 0.045  # in corners, metres per frame squared (4.5 m/s^2)
-ACCELERATION = 0.022  # along the road, metres per frame squared
-FEWEST_LOOP_FRAMES = 250
 
 
 @dataclass(frozen=True)

@@ -114,22 +114,42 @@ class SimulatedStreet(SimulatedWorld):
         return self._route.T_street_camera[index : index + 1]
 
     def _background(self, directions: Float32Array) -> Float32Array:
-        return sky(self._weather, directions)
+        weather, up = self._weather, np.clip(directions[2], 0.0, 1.0)
+        rgb = weather.horizon[:, None] + np.sqrt(up) * (weather.zenith - weather.horizon)[:, None]
+        plane = directions[:2] / (up + 0.12)
+        still = np.zeros_like(up)
+        size = 0.006 / (up + 0.12)
+        texels = Texels(plane[0], plane[1], size, size, still, still)
+        cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
+        fraction = np.clip(1.6 * cover, 0.0, 0.85)
+        white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
+        return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
 
     def _shade(
         self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
     ) -> Float32Array:
-        towards = np.flatnonzero(self._weather.sun @ hits.normals > 0.0)
+        weather, mesh = self._weather, surfaces[number].mesh
+        towards = np.flatnonzero(weather.sun @ hits.normals > 0.0)
         to_sun = np.take(rays, towards, axis=0)
         to_sun[:, :3] += to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
-        to_sun[:, 3:] = self._weather.sun
+        to_sun[:, 3:] = weather.sun
         tensor = import_open3d().core.Tensor(to_sun)
         shadow = np.any([surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0)
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
         lit[pixels[towards]] = 1.0 - shadow
         soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))  # over neighbouring pixels
         lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
-        return paint(surfaces[number], hits, lit, self._weather, self.camera.fx)
+        rgb = surfaces[number].unlit(hits, self.camera.fx)
+        if weather.contrast != 1.0:
+            base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
+            rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
+        direct = weather.sunshine * np.clip(weather.sun @ hits.normals, 0.0, 1.0) * lit
+        around = weather.ambient * (0.78 + 0.22 * hits.normals[2])
+        warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
+        cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
+        rgb *= np.asarray(direct * warm + around * cool, dtype=np.float32)  # irradiance
+        haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+        return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
         """Rain, lens blur and exposure."""
@@ -269,40 +289,6 @@ def draw_varied_weather(seed: int) -> Weather:
         saturated=float(rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04)),
         contrast=float(rng.uniform(1.2, 3.0)),
     )
-
-
-def sky(weather: Weather, directions: Float32Array) -> Float32Array:
-    """Colour of the sky along unit ``directions`` in the street frame, ``(3, N)`` both."""
-    up = np.clip(directions[2], 0.0, 1.0)
-    rgb = weather.horizon[:, None] + np.sqrt(up) * (weather.zenith - weather.horizon)[:, None]
-    plane = directions[:2] / (up + 0.12)
-    still = np.zeros_like(up)
-    size = 0.006 / (up + 0.12)
-    texels = Texels(plane[0], plane[1], size, size, still, still)
-    cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
-    fraction = np.clip(1.6 * cover, 0.0, 0.85)
-    white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
-    return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
-
-
-def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32Array:
-    """Irradiance ``(3, N)`` on surfaces of unit normals ``(3, N)`` towards the viewer; ``lit`` is 1 in the sun."""
-    direct = weather.sunshine * np.clip(weather.sun @ normals, 0.0, 1.0) * lit
-    around = weather.ambient * (0.78 + 0.22 * normals[2])
-    warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
-    cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
-    return np.asarray(direct * warm + around * cool, dtype=np.float32)
-
-
-def paint(surface: Surface, hits: Hits, lit: Float32Array, weather: Weather, focal_px: float) -> Float32Array:
-    """Colour ``(3, N)`` of each hit on a mesh in the open; ``lit`` ``(N,)`` is 1 where the sun is seen."""
-    rgb, mesh = surface.unlit(hits, focal_px), surface.mesh
-    if weather.contrast != 1.0:
-        base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
-        rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
-    rgb *= light(weather, hits.normals, lit)
-    haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
-    return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
 
 
 class Traffic:

@@ -109,9 +109,20 @@ class SimulatedStreet(SimulatedWorld):
         return max(1.0 / brightest, _DARKEST_MEAN / float(np.mean(np.minimum(views, brightest))))
 
     def _exposures(self, index: int) -> FloatArray:
+        T_street_camera = self._route.T_street_camera
         if "blur" in self.options.hazards:
-            return shutter_poses(self._route.T_street_camera, index)
-        return self._route.T_street_camera[index : index + 1]
+            # poses while the shutter is open around a frame; all one pose at a stop
+            low, high = max(index - 1, 0), min(index + 1, len(T_street_camera) - 1)
+            here = T_street_camera[index]
+            T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
+            turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
+            if np.array_equal(here, T_street_camera[high]):
+                return np.repeat(here[None], BLUR_SAMPLES, axis=0)
+            fraction = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
+            fraction *= SHUTTER / (high - low)
+            motion = fraction[:, None] * turn, fraction[:, None] * T_low_high[:3, 3]
+            return np.asarray(here @ se3.from_rotation_vector(*motion))
+        return T_street_camera[index : index + 1]
 
     def _background(self, directions: Float32Array) -> Float32Array:
         weather, up = self._weather, np.clip(directions[2], 0.0, 1.0)
@@ -161,7 +172,10 @@ class SimulatedStreet(SimulatedWorld):
             gain, gamma = self._exposure[index].tolist()
             rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
         if self._variety is not None:
-            rgb = sensed(rgb, self._variety.vignette, self._variety.noise, self.options.seed, index)
+            y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
+            falloff = 1.0 - np.float32(0.5 * self._variety.vignette) * (x * x + (y * y)[:, None])
+            grain = np.random.default_rng([self.options.seed, 35, index]).standard_normal(rgb.shape, dtype=np.float32)
+            rgb = np.asarray(rgb * falloff[..., None] + np.float32(self._variety.noise) * grain)
         return rgb
 
 
@@ -205,28 +219,6 @@ def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
     streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
     veiled = rgb * 0.85 + 0.07
     return np.asarray(veiled + streaks * (0.85 - veiled), dtype=np.float32)
-
-
-def sensed(rgb: Float32Array, vignette: float, noise: float, seed: int, index: int) -> Float32Array:
-    """An image ``(H, W, 3)`` that lacks a share of light in its corners, under noise of a deviation."""
-    y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
-    falloff = 1.0 - np.float32(0.5 * vignette) * (x * x + (y * y)[:, None])
-    grain = np.random.default_rng([seed, 35, index]).standard_normal(rgb.shape, dtype=np.float32)
-    return np.asarray(rgb * falloff[..., None] + np.float32(noise) * grain)
-
-
-def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
-    """Poses while the shutter is open around a frame, ``(BLUR_SAMPLES, 4, 4)``; all one pose at a stop."""
-    low, high = max(index - 1, 0), min(index + 1, len(T_street_camera) - 1)
-    here = T_street_camera[index]
-    T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
-    turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
-    if np.array_equal(here, T_street_camera[high]):
-        return np.repeat(here[None], BLUR_SAMPLES, axis=0)
-    fraction = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
-    fraction *= SHUTTER / (high - low)
-    T_here_shutter = se3.from_rotation_vector(fraction[:, None] * turn, fraction[:, None] * T_low_high[:3, 3])
-    return np.asarray(here @ T_here_shutter)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ from slam.results.truth import find_truth
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.motion import FASTEST_TURN_DEG
 from slam.simulation.options import Motion, SimulationOptions
-from slam.simulation.rooms import SimulatedRooms
+from slam.simulation.rooms import FASTEST_TURN_DEG, SimulatedRooms
 
 SMALL = {"width": 96, "height": 72}
 

@@ -314,8 +314,7 @@ class Interior:
             papered = float(rng.uniform(0.1, 0.3)) if rng.random() < 0.2 else 0.0
             wall = self.soup.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
         for number in range(4):
-            self._enclose(room, number, wall)
-            self._furnish(room, number)
+            self._furnish(room, number, wall)
         self._fill_middle(room)
         self._lamps(room)
 
@@ -340,20 +339,15 @@ class Interior:
         u, v = np.meshgrid(a * width, b * height + corner[2] * (up[2] > 0.0))
         self.soup.patch(points, np.stack([u, v], axis=2), look)
 
-    def _enclose(self, room: Room, number: int, look: int) -> None:
-        """One wall around its doors, seen from inside."""
+    def _furnish(self, room: Room, number: int, wall: int) -> None:
+        """One wall around its doors, seen from inside; furniture along it, pictures above that and windows."""
+        rng, openings = self.rng, self.house.openings(room, number)
         (x, y), angle, length = room.side(number)
         ahead, up = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([0.0, 0.0, 1.0])
-        edges = [0.0, *np.ravel(self.house.openings(room, number)), length]
-        for k, (start, end) in enumerate(pairwise(edges)):
+        for k, (start, end) in enumerate(pairwise([0.0, *np.ravel(openings), length])):
             low = DOOR_HEIGHT * (k % 2)
-            self._panel(np.array([x, y, low]) + end * ahead, (start - end) * ahead, (room.height - low) * up, look)
-
-    def _furnish(self, room: Room, number: int) -> None:
-        """Furniture along one wall, pictures above it and windows in it."""
-        rng = self.rng
-        (x, y), angle, length = room.side(number)
-        doors = [(a - 0.35, b + 0.35) for a, b in self.house.openings(room, number)]
+            self._panel(np.array([x, y, low]) + end * ahead, (start - end) * ahead, (room.height - low) * up, wall)
+        doors = [(a - 0.35, b + 0.35) for a, b in openings]
         windows = self._windows(room, number)
         density = {"corridor": 0.15, "hall": 0.7, "bath": 0.6}.get(room.kind, 0.8)
         pieces = STANDING[room.kind]

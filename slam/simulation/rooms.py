@@ -18,7 +18,7 @@ from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, IntArray, Material, Mesh, Moving
-from slam.simulation.house import Interior, Room
+from slam.simulation.house import Interior
 from slam.simulation.objects import person
 from slam.simulation.options import Motion, SimulationOptions
 from slam.simulation.texture import GLOWING
@@ -70,7 +70,17 @@ class Floor:
         self._clearance = np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL, dtype=np.float64)
         self._cells = np.argwhere(self._clearance >= _CLEAR_M)[:, ::-1]  # (C, 2), column and row
         self._graph = self._connect()
-        self.places, self.room, self._at = self._choose(house.rooms, np.random.default_rng([seed, 52]))
+        rng, (_, part) = np.random.default_rng([seed, 52]), connected_components(self._graph, directed=False)
+        centres = self._centres(self._cells)
+        roomy = (part == np.bincount(part).argmax()) & (self.clearance(centres) >= _PLACE_CLEAR_M)
+        chosen: list[int] = []
+        rooms: list[int] = []
+        for number, room in enumerate(house.rooms):  # up to five places a room
+            inside = np.flatnonzero(roomy & room.contains(centres))
+            found = rng.choice(inside, min(len(inside), 5), replace=False)
+            chosen.extend(found)
+            rooms.extend([number] * len(found))
+        self.places, self.room, self._at = centres[chosen], np.array(rooms), np.array(chosen)
 
     def clearance(self, points: FloatArray) -> FloatArray:
         """Distance in plan from points ``(M, 2)`` to what stands there, metres, ``(M,)``."""
@@ -115,20 +125,6 @@ class Floor:
             lengths.append(CELL * np.hypot(*step) * (1.0 + 0.15 / near**2))
         joined = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
         return coo_array(joined, shape=(len(self._cells),) * 2).tocsr()
-
-    def _choose(self, house_rooms: list[Room], rng: np.random.Generator) -> tuple[FloatArray, IntArray, IntArray]:
-        """Up to five places a room: where they are, their rooms and their cells."""
-        _, part = connected_components(self._graph, directed=False)
-        centres = self._centres(self._cells)
-        roomy = (part == np.bincount(part).argmax()) & (self.clearance(centres) >= _PLACE_CLEAR_M)
-        chosen: list[int] = []
-        rooms: list[int] = []
-        for number, room in enumerate(house_rooms):
-            inside = np.flatnonzero(roomy & room.contains(centres))
-            found = rng.choice(inside, min(len(inside), 5), replace=False)
-            chosen.extend(found)
-            rooms.extend([number] * len(found))
-        return centres[chosen], np.array(rooms), np.array(chosen)
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - a floor lives as long as its world
     def _from(self, start: int) -> tuple[FloatArray, IntArray]:

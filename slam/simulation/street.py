@@ -60,14 +60,26 @@ class SimulatedStreet(SimulatedWorld):
         self.T_camera_lidar = T_CAMERA_LIDAR.copy()
         self._variety = variety
         self._weather = draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
-        self._exposure = exposure_curve(options.seed, options.frames)
+        rng = np.random.default_rng([options.seed, 31])
+        self._exposure = np.empty((options.frames, 2))  # gain and gamma of every frame, piecewise constant
+        start = 0
+        while start < options.frames:
+            stop = start + int(rng.integers(12, 45))
+            self._exposure[start:stop] = rng.uniform(0.55, 1.5), rng.uniform(0.75, 1.3)
+            start = stop
         self._traffic = Traffic(self._route, options.seed, options.varied) if "moving-cars" in options.hazards else None
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
         self._require(index)
         rng = np.random.default_rng([self.options.seed, 40, index])
-        directions = beam_directions(rng)
+        # each spin starts at a random angle: with the same rays in every scan the rings on the ground would repeat
+        # exactly, and scan matching would estimate zero motion
+        azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
+        elevation = np.deg2rad(np.linspace(HIGHEST_DEG, LOWEST_DEG, BEAMS))[:, None]
+        elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
+        x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+        directions = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3).astype(np.float32)
         T_street_lidar = self._route.T_street_camera[index] @ self.T_camera_lidar
         rays = place_rays(T_street_lidar, directions)
         ranges = np.full(len(rays), np.inf, dtype=np.float32)
@@ -177,33 +189,6 @@ class SimulatedStreet(SimulatedWorld):
             grain = np.random.default_rng([self.options.seed, 35, index]).standard_normal(rgb.shape, dtype=np.float32)
             rgb = np.asarray(rgb * falloff[..., None] + np.float32(self._variety.noise) * grain)
         return rgb
-
-
-def beam_directions(rng: np.random.Generator) -> Float32Array:
-    """Unit directions of one spin in the LiDAR frame, ``(BEAMS * COLUMNS, 3)``.
-
-    Each spin starts at a random angle: with the same rays in every scan the rings on the ground would repeat
-    exactly, and scan matching would estimate zero motion.
-    """
-    azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
-    elevation = np.deg2rad(np.linspace(HIGHEST_DEG, LOWEST_DEG, BEAMS))[:, None]
-    elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
-    directions = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
-    )
-    return directions.reshape(-1, 3).astype(np.float32)
-
-
-def exposure_curve(seed: int, frames: int) -> FloatArray:
-    """Gain and gamma of every frame ``(N, 2)``, piecewise constant."""
-    rng = np.random.default_rng([seed, 31])
-    curve = np.empty((frames, 2))
-    start = 0
-    while start < frames:
-        stop = start + int(rng.integers(12, 45))
-        curve[start:stop] = rng.uniform(0.55, 1.5), rng.uniform(0.75, 1.3)
-        start = stop
-    return curve
 
 
 def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:

@@ -14,7 +14,7 @@ from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply
 from slam.frames import Intrinsics
 from slam.mapping.depth import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
-from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap, ViewChooser
+from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, ViewChooser
 from slam.mapping.surface import MapSurface
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.storage.spill import SpillFile
@@ -125,6 +125,6 @@ class TsdfMap:
         """Spill the submap that grows, if there is one."""
         if self._growing is None or not self._growing.blocks:
             return
-        submap = Submap(*self._growing.observed(), **self._views.take(self._intrinsics))
-        self._finished.append(submap.spilled(self._spill))
+        fields = self._growing.observed() | self._views.take(self._intrinsics)
+        self._finished.append({name: self._spill.put(values) for name, values in fields.items()})
         self._growing = None

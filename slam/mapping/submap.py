@@ -7,7 +7,7 @@ of the sharpest keyframe of every stretch, with the exposures evened out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,7 +21,7 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
-from slam.runtime.storage.spill import SpilledArray, SpillFile
+from slam.runtime.storage.spill import SpilledArray
 
 Keys = NDArray[np.int64]
 SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk
@@ -68,14 +68,6 @@ class Submap:
     depths: NDArray[np.float16]
     brightness_steps: FloatArray
     camera: FloatArray
-
-    def spilled(self, file: SpillFile) -> SpilledSubmap:
-        """The same on disk.
-
-        Raises:
-            SlamError: the disk is full.
-        """
-        return {each.name: file.put(getattr(self, each.name)) for each in fields(self)}
 
     def blocks(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
         """Observed voxels ``(C, 4096)`` of the chosen ``(B,)`` blocks, and their places in ``tsdf``, in order."""
@@ -131,18 +123,16 @@ class Fusion:
         self._position = position
         return True
 
-    def observed(
-        self,
-    ) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.float16], NDArray[np.uint16]]:
-        """Keys, bits of observed voxels, their distances and weights, as in `Submap`, in the order of the keys."""
+    def observed(self) -> dict[str, NDArray[Any]]:
+        """Keys, bits of observed voxels, their distances and weights, as fields of a `Submap`, in order of the keys."""
         places = self._grid.hashmap().active_buf_indices().numpy().astype(np.int64)
         keys = self._grid.hashmap().key_tensor().numpy()[places]
         order = np.lexsort(keys.T)  # that of Open3D's threads is not reproducible
         weight = self._grid.attribute("weight").numpy().reshape(-1, BLOCK_VOXELS)[places[order]]
         seen = weight > 0
-        tsdf = self._grid.attribute("tsdf").numpy().reshape(-1, BLOCK_VOXELS)[places[order]][seen]
+        tsdf = self._grid.attribute("tsdf").numpy().reshape(-1, BLOCK_VOXELS)[places[order]][seen].astype(np.float16)
         weights = np.minimum(weight[seen], _MOST_WEIGHT).astype(np.uint16)
-        return keys[order], np.packbits(seen, axis=1), tsdf.astype(np.float16), weights
+        return {"keys": keys[order], "observed": np.packbits(seen, axis=1), "tsdf": tsdf, "weight": weights}
 
 
 class MergedSubmaps:
@@ -155,7 +145,7 @@ class MergedSubmaps:
         self.T_world_views: FloatArray = np.concatenate(poses)
         self.brightness_steps: FloatArray = np.concatenate(steps)
         self.submap_of_view = np.repeat(np.arange(len(submaps)), [len(each) for each in steps])
-        self.count = len(self._keys)
+        self.count, self.blocks = len(self._keys), len(np.unique(np.concatenate(self._keys), axis=0))
 
         @lru_cache(maxsize=_REMEMBERED)
         def read(number: int) -> Submap:
@@ -168,10 +158,6 @@ class MergedSubmaps:
         tiles = np.concatenate([keys // TILE_BLOCKS for keys in self._keys])
         _, first = np.unique(tiles, axis=0, return_index=True)
         return tiles[np.sort(first)]
-
-    def block_count(self) -> int:
-        """Number of different blocks."""
-        return len(np.unique(np.concatenate(self._keys), axis=0))
 
     def merged(self, low: Keys, high: Keys) -> tuple[Keys, NDArray[np.float32], NDArray[np.float32]]:
         """Blocks with ``low <= key < high``: the weighted means of the blocks of all submaps.
@@ -225,7 +211,7 @@ class ViewChooser:
         if self._best is None or sharpness > self._best[0]:
             self._best = sharpness, replace(view, depth=kept, relative_sigma=None)
 
-    def take(self, camera: Intrinsics) -> dict[str, Any]:
+    def take(self, camera: Intrinsics) -> dict[str, NDArray[Any]]:
         """The views since the last call, as fields of a `Submap`."""
         self._close()
         views, steps = self._chosen, self._steps

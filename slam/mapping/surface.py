@@ -85,8 +85,20 @@ class MapSurface:
         submaps = MergedSubmaps(finished)
         self._spill = SpillFile("the map")
         self._pieces: list[Piece] = []
-        self.blocks, self.submaps = submaps.block_count(), submaps.count
-        self._extract(submaps, config, progress)
+        self.blocks, self.submaps = submaps.blocks, submaps.count
+        painter = Painter(submaps, config.voxel_size_m, config.reach_m)
+        tiles = submaps.tiles()
+        for done, tile in enumerate(tiles, 1):
+            patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
+            if patch is not None and config.close_holes_m > 0:
+                # upwards in the camera of the view nearest to the tile
+                middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * config.voxel_size_m
+                nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
+                up = -submaps.T_world_views[nearest, :3, 1]
+                patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
+            if patch is not None and patch.own.any():
+                self._pieces.append(_piece(patch, painter, self._spill))
+            progress("mesh", done, len(tiles))
         if not self._pieces:
             raise EmptyMapError("the map is empty: no surface was seen")
         self._rows = _numbered(self._pieces, _LEAST_TRIANGLES, self._spill)
@@ -129,22 +141,6 @@ class MapSurface:
     def write_cloud(self, path: Path) -> None:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
         write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces())
-
-    def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress) -> None:
-        painter = Painter(submaps, config.voxel_size_m, config.reach_m)
-        tiles = submaps.tiles()
-        for done, tile in enumerate(tiles, 1):
-            patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
-            if patch is not None:
-                if config.close_holes_m > 0:
-                    # upwards in the camera of the view nearest to the tile
-                    middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * config.voxel_size_m
-                    nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
-                    up = -submaps.T_world_views[nearest, :3, 1]
-                    patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
-                if patch.own.any():
-                    self._pieces.append(_piece(patch, painter, self._spill))
-            progress("mesh", done, len(tiles))
 
 
 def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:

@@ -162,7 +162,7 @@ assert tuple(GAITS) == get_args(Motion)
 class Carried:
     """A motion, ``CLOCK`` samples a second.
 
-    Its channels are x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians.
+    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians.
     """
 
     def __init__(self, floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> None:

@@ -47,7 +47,7 @@ INTERFACE = {
     "slam.config.sections": ("load_config",),
     "slam.formats.trajectory": ("Trajectory", "read_trajectory", "write_kitti", "write_tum"),
     "slam.evaluation.trajectory": ("trajectory_metrics", "align"),
-    "slam.pipeline.live_poses": ("LivePose",),
+    "slam.pipeline.live": ("LivePose",),
     "slam.frames": ("Intrinsics", "Frame", "Sequence", "Predictor", "SnippetPoses", "RelativePose", "View"),
     "slam.sequences.catalogue": ("open_sequence",),
     "slam.sequences.recording": ("RecordedSequence", "Source"),

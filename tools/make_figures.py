@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from shared.command import one_line_errors, parser_of
 
 from erfsfm.inference import DepthPosePredictor, colour_disparity
-from slam.evaluation.drift import aligned
+from slam.evaluation.trajectory import aligned
 from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence
 from slam.geometry.se3 import FloatArray

@@ -38,9 +38,8 @@ from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import SimulatedSequence, open_sequence
-from slam.simulation.hazards import Hazard
 from slam.simulation.kitti_layout import write_image, write_lines
-from slam.simulation.options import SimulationOptions
+from slam.simulation.options import Hazard, SimulationOptions
 
 Image = NDArray[np.uint8]
 WORDS = ("every word of this line hides a part of the road", "and the next line hides another part of it")

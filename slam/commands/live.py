@@ -40,7 +40,7 @@ from slam.frontend.drive import Drive
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.live_poses import LivePose, LivePoses
+from slam.pipeline.live import LivePose, LivePoses
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.prediction.assembly import open_prediction

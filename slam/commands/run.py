@@ -26,7 +26,7 @@ from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline

@@ -1,36 +1,40 @@
 """Errors of a trajectory: the object T of ``metrics.json``, with evo as a cross-check.
 
-The paper's snippets, absolute errors under five alignments (Umeyama 1991), KITTI's segment errors (Geiger
-et al. 2012) and the errors of single steps. This is the only file that imports evo, and only inside a
-function: all other numbers are computed without it.
+The paper's snippets, absolute errors under five alignments (Umeyama 1991), KITTI's drift over segments of a given path
+length (Geiger et al. 2012) and the errors of single steps; the alignment and the segments also for figures of a run.
+This is the only file that imports evo, and only inside a function: all other numbers are computed without it.
 """
 
 from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
-from slam.evaluation.drift import KITTI_LENGTHS_M, SegmentErrors, relative_errors, segment_errors
 from slam.formats.trajectory import Trajectory, associate, matching_tolerance_s, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import ConfigError, Failed, TrajectoryError
+from slam.runtime.files import REFERENCE
 from slam.runtime.record import Count, Record, part
 
+IndexArray = NDArray[np.intp]
 Alignment = Literal["none", "first", "scale", "6dof", "7dof"]
-ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 
+KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+FIGURE_LENGTHS_M = (10.0, 20.0, 50.0, *KITTI_LENGTHS_M)
+SEGMENT_STEP = 10
+ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 SNIPPET_LENGTH = 5
 _SAME_ROTATION = 1e-9  # of the entries of a matrix
-
 # With fewer frames an alignment fits exactly, and its zero error is meaningless.
 _FEWEST_FRAMES: dict[Alignment, int] = {"none": 2, "first": 2, "scale": 3, "6dof": 3, "7dof": 3}
 _NO_REFERENCE = "there is no reference trajectory"
@@ -38,6 +42,80 @@ _NOTHING_MOVES = "neither the estimate nor the reference moves, so there is no e
 _BACKWARDS = Failed("the best scale is negative: the estimate goes the other way")
 _OPPOSITE = -0.9  # cosine between the positions of snippets
 _REFERENCE_STANDS_STILL = Failed("the reference does not move, so scaling would hide every error")
+
+
+@dataclass(frozen=True)
+class SegmentErrors:
+    """Errors of all segments of one path length, both ``(S,)``: ``translation_m``, ``rotation`` in radians."""
+
+    length_m: float
+    translation_m: FloatArray
+    rotation: FloatArray
+
+
+def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
+    """Estimates brought to the reference by the best similarity of positions (Umeyama 1991).
+
+    Without a reference they stay as written, only the raw network is brought to the optimised one's scale.
+    """
+    drawn = dict(trajectories)
+    if REFERENCE in drawn:
+        for name in trajectories.keys() - {REFERENCE}:
+            estimate, truth = associate(drawn[name], drawn[REFERENCE])
+            fit = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
+            drawn[name] = replace(drawn[name], T_world_camera=fit.apply_to_poses(drawn[name].T_world_camera))
+    elif "network" in drawn and "optimised" in drawn:
+        raw, optimised = associate(drawn["network"], drawn["optimised"])
+        energy = float((raw.positions**2).sum())
+        scale = float((raw.positions * optimised.positions).sum()) / energy if energy > 0 else 1.0
+        fit = se3.Similarity(scale, np.eye(3), np.zeros(3))
+        drawn["network"] = replace(drawn["network"], T_world_camera=fit.apply_to_poses(drawn["network"].T_world_camera))
+    return drawn
+
+
+def paired(trajectories: Mapping[str, Trajectory]) -> Iterator[tuple[str, Trajectory, Trajectory]]:
+    """Name, aligned estimate and truth, row by row, of every estimate; a reference is among the trajectories."""
+    for name, trajectory in aligned(trajectories).items():
+        if name != REFERENCE:
+            yield name, *associate(trajectory, trajectories[REFERENCE])
+
+
+def segment_errors(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, lengths_m: Iterable[float]
+) -> list[SegmentErrors]:
+    """Relative errors of all segments of each length within the true path, starting every ten frames.
+
+    A segment ends at the first frame beyond its length. Lengths without a segment are left out.
+
+    Args:
+        T_world_estimate: poses ``(N, 4, 4)``, row k beside row k of the reference, in metres.
+        T_world_reference: true poses ``(N, 4, 4)``.
+        lengths_m: path lengths, in increasing order.
+    """
+    distance = se3.path_distance(T_world_reference)
+    segments = []
+    for length_m in lengths_m:
+        starts = np.arange(0, len(distance), SEGMENT_STEP)
+        ends = np.searchsorted(distance, distance[starts] + length_m, side="right")
+        fits = ends < len(distance)
+        if not fits.any():
+            break
+        errors = relative_errors(T_world_estimate, T_world_reference, starts[fits], ends[fits])
+        segments.append(SegmentErrors(length_m, *errors))
+    return segments
+
+
+def relative_errors(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, starts: IndexArray, ends: IndexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Translation (metres) and rotation (radians) errors ``(M,)`` of the motions between pairs of rows.
+
+    E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
+    """
+    T_start_end_estimate = se3.invert(T_world_estimate[starts]) @ T_world_estimate[ends]
+    T_start_end_reference = se3.invert(T_world_reference[starts]) @ T_world_reference[ends]
+    T_error = se3.invert(T_start_end_estimate) @ T_start_end_reference
+    return np.linalg.norm(T_error[:, :3, 3], axis=1), se3.rotation_angle(T_error[:, :3, :3])
 
 
 class SnippetMetrics(Record):
@@ -161,8 +239,11 @@ def trajectory_metrics(
     without_ate = None
     if _stands_still(T_world_reference):
         without_ate = _REFERENCE_STANDS_STILL
-    elif snippet5 is None and _goes_backwards(predicted, true):
-        without_ate = _BACKWARDS
+    elif snippet5 is None:
+        # snippets that point against the true ones, which a negative scale would take for a good fit
+        p, g = predicted[..., :3, 3], true[..., :3, 3]
+        if (g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()):
+            without_ate = _BACKWARDS
     if snippet5 is None and len(predicted):
         snippet5 = snippet_errors(predicted, true)
     return TrajectoryMetrics(
@@ -275,12 +356,6 @@ def _alignment_metrics(
     if not isinstance(aligned.scale, Failed) and aligned.scale <= 0:
         return AlignedMetrics.unknown(_BACKWARDS.reason)
     return AlignedMetrics.of(**{name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()})
-
-
-def _goes_backwards(predicted: FloatArray, truth: FloatArray) -> bool:
-    """Whether snippets point against the true ones, which a negative scale would take for a good fit."""
-    p, g = predicted[..., :3, 3], truth[..., :3, 3]
-    return bool((g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()))
 
 
 def _snippet_metrics(errors: SnippetErrors | None, without_ate: Failed | None = None) -> SnippetMetrics:

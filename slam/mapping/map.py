@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -14,10 +13,9 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply
 from slam.frames import Intrinsics
-from slam.mapping.filters import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
-from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
+from slam.mapping.depth import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
+from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, ViewChooser
 from slam.mapping.surface import MapSurface
-from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.resources import SpillFile
 
@@ -105,17 +103,13 @@ class TsdfMap:
         return sizes | frames | {"voxel_size": self.voxel_size, "filters": self._filters.shares()}
 
     def _fuse_waiting(self, following: KeyframeDepth | None) -> None:
-        """Fuse the view that waits for the one after it."""
+        """Filter and fuse the view that waits for the one after it; a submap long or large enough ends with it."""
         if self._waiting is None:
             return
-        view, self._waiting = self._waiting, None
-        self._fuse(view, [*list(self._before)[-1:], *([] if following is None else [following])])
-        self._before.append(view)
-
-    def _fuse(self, view: KeyframeDepth, others: Sequence[KeyframeDepth]) -> None:
-        """Filter and fuse a view, and begin a new submap where this one is long or large enough."""
+        view, self._waiting, config = self._waiting, None, self._config
+        others = [*list(self._before)[-1:], *([] if following is None else [following])]
         kept = self._filters.kept(view, others, next(iter(self._before), None))
-        config = self._config
+        self._before.append(view)
         if self._growing is None:
             self._growing = Fusion(config.voxel_size_m, config.reach_m, self._intrinsics)
         if not self._growing.integrate(kept, view.T_world_camera):
@@ -131,6 +125,6 @@ class TsdfMap:
         """Spill the submap that grows, if there is one."""
         if self._growing is None or not self._growing.blocks:
             return
-        submap = Submap(*self._growing.observed(), **self._views.take(self._intrinsics))
-        self._finished.append(submap.spilled(self._spill))
+        fields = self._growing.observed() | self._views.take(self._intrinsics)
+        self._finished.append({name: self._spill.put(values) for name, values in fields.items()})
         self._growing = None

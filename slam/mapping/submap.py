@@ -1,22 +1,30 @@
 """Submaps: the fused voxels of stretches of road and the views that colour them, and their weighted mean.
 
-All submaps share one lattice of blocks in the world. Depth maps are fused as by Curless and Levoy (1996).
+All submaps share one lattice of blocks in the world. Depth maps are fused as by Curless and Levoy (1996). Colours are
+of the sharpest keyframe of every stretch, with the exposures evened out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+from scipy.spatial import cKDTree
 
-from slam.frames import DepthMap, Intrinsics
-from slam.geometry.se3 import FloatArray, invert
+from slam.frames import DepthMap, Image, Intrinsics
+from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
+from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
-from slam.runtime.resources import SpilledArray, SpillFile
+from slam.runtime.resources import SpilledArray
+
+Keys = NDArray[np.int64]
+SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk
 
 BLOCK_SIDE = 16
 BLOCK_VOXELS = BLOCK_SIDE**3
@@ -26,9 +34,18 @@ TRUNCATION_VOXELS = 10.0  # of the signed distance: 4 lose completeness, 12 accu
 _CAPACITY = 1000  # blocks of 32 KiB; growing takes Open3D a moment
 _MOST_WEIGHT = np.iinfo(np.uint16).max
 _REMEMBERED = 4  # submaps; neighbouring tiles need the same ones
-
-Keys = NDArray[np.int64]
-SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk
+_STEP = 0.1  # of the largest fused depth
+_STEP_DEG = 10.0
+_STRIDE = 7  # of the pixels that compare the brightness of two views
+_SAME_SURFACE = 0.05  # largest relative difference of depth
+_LEAST_SHARED = 50  # pixels
+_DARK = 8.0  # grey levels below which a ratio says little
+_BRIGHT = 247.0
+_GREY = 128
+_NEARNESS = 4  # power of the distance that a view's weight falls with
+_SAME_VOXELS = 1.5  # or so many voxels
+_NEAREST_VOXELS = 0.5  # least depth of a point that a view may show
+_EXPOSURE_PRIOR = 0.01  # of equal exposures, over the information in the brightness of two views
 
 
 @dataclass(frozen=True)
@@ -52,14 +69,6 @@ class Submap:
     brightness_steps: FloatArray
     camera: FloatArray
 
-    def spilled(self, file: SpillFile) -> SpilledSubmap:
-        """The same on disk.
-
-        Raises:
-            SlamError: the disk is full.
-        """
-        return {each.name: file.put(getattr(self, each.name)) for each in fields(self)}
-
     def blocks(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
         """Observed voxels ``(C, 4096)`` of the chosen ``(B,)`` blocks, and their places in ``tsdf``, in order."""
         counts = np.bitwise_count(self.observed).sum(axis=1, dtype=np.int64)
@@ -68,11 +77,6 @@ class Submap:
         shift = np.repeat(begin - (np.cumsum(count) - count), count)
         places = np.arange(count.sum()) + shift
         return np.unpackbits(self.observed[chosen], axis=1).astype(bool), places
-
-    @classmethod
-    def read(cls, spilled: SpilledSubmap) -> Submap:
-        """A submap from disk."""
-        return cls(**{name: array.read() for name, array in spilled.items()})
 
 
 def new_grid(voxel_size_m: float, capacity: int = _CAPACITY) -> Any:
@@ -119,18 +123,16 @@ class Fusion:
         self._position = position
         return True
 
-    def observed(
-        self,
-    ) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.float16], NDArray[np.uint16]]:
-        """Keys, bits of observed voxels, their distances and weights, as in `Submap`, in the order of the keys."""
+    def observed(self) -> dict[str, NDArray[Any]]:
+        """Keys, bits of observed voxels, their distances and weights, as fields of a `Submap`, in order of the keys."""
         places = self._grid.hashmap().active_buf_indices().numpy().astype(np.int64)
         keys = self._grid.hashmap().key_tensor().numpy()[places]
         order = np.lexsort(keys.T)  # that of Open3D's threads is not reproducible
         weight = self._grid.attribute("weight").numpy().reshape(-1, BLOCK_VOXELS)[places[order]]
         seen = weight > 0
-        tsdf = self._grid.attribute("tsdf").numpy().reshape(-1, BLOCK_VOXELS)[places[order]][seen]
+        tsdf = self._grid.attribute("tsdf").numpy().reshape(-1, BLOCK_VOXELS)[places[order]][seen].astype(np.float16)
         weights = np.minimum(weight[seen], _MOST_WEIGHT).astype(np.uint16)
-        return keys[order], np.packbits(seen, axis=1), tsdf.astype(np.float16), weights
+        return {"keys": keys[order], "observed": np.packbits(seen, axis=1), "tsdf": tsdf, "weight": weights}
 
 
 class MergedSubmaps:
@@ -143,18 +145,19 @@ class MergedSubmaps:
         self.T_world_views: FloatArray = np.concatenate(poses)
         self.brightness_steps: FloatArray = np.concatenate(steps)
         self.submap_of_view = np.repeat(np.arange(len(submaps)), [len(each) for each in steps])
-        self.count = len(self._keys)
-        self.read = lru_cache(maxsize=_REMEMBERED)(lambda number: Submap.read(submaps[number]))
+        self.count, self.blocks = len(self._keys), len(np.unique(np.concatenate(self._keys), axis=0))
+
+        @lru_cache(maxsize=_REMEMBERED)
+        def read(number: int) -> Submap:
+            return Submap(**{name: array.read() for name, array in submaps[number].items()})
+
+        self.read = read
 
     def tiles(self) -> Keys:
         """Coordinates ``(N, 3)`` of the cubes of 16 blocks a side in which anything was observed, along the drive."""
         tiles = np.concatenate([keys // TILE_BLOCKS for keys in self._keys])
         _, first = np.unique(tiles, axis=0, return_index=True)
         return tiles[np.sort(first)]
-
-    def block_count(self) -> int:
-        """Number of different blocks."""
-        return len(np.unique(np.concatenate(self._keys), axis=0))
 
     def merged(self, low: Keys, high: Keys) -> tuple[Keys, NDArray[np.float32], NDArray[np.float32]]:
         """Blocks with ``low <= key < high``: the weighted means of the blocks of all submaps.
@@ -165,11 +168,16 @@ class MergedSubmaps:
         keys = np.unique(np.concatenate([own[mask] for own, mask in zip(self._keys, inside)]), axis=0)
         weight = np.zeros((len(keys), BLOCK_VOXELS), np.float32)
         total = np.zeros_like(weight)
+
+        def cells(of_blocks: Keys) -> NDArray[np.intp]:
+            return np.asarray(np.ravel_multi_index(tuple((of_blocks - low).T), tuple(high - low)))
+
         for number, mask in enumerate(inside):
             if not mask.any():
                 continue
             submap = self.read(number)
-            rows = _rows(keys, self._keys[number][mask], low, high)
+            # where each block of the submap is among all of them: the numbers of their cells are sorted as their keys
+            rows = np.searchsorted(cells(keys), cells(self._keys[number][mask]))
             observed, places = submap.blocks(mask)
             own = np.zeros(observed.shape, np.float32)
             own[observed] = submap.weight[places]
@@ -180,13 +188,145 @@ class MergedSubmaps:
         return keys, total, weight
 
 
-def _rows(keys: Keys, wanted: Keys, low: Keys, high: Keys) -> NDArray[np.intp]:
-    """Where each of the wanted keys is among sorted, different keys."""
-    size = high - low
+class ViewChooser:
+    """Chooses the views of one submap after the other."""
 
-    def flat(k: Keys) -> NDArray[np.int64]:
-        x, y, z = (k - low).T
-        number: NDArray[np.int64] = (x * size[1] + y) * size[2] + z
-        return number
+    def __init__(self, filters: DepthFilters, depth_max_m: float) -> None:
+        """Of the camera of these filters; ``depth_max_m`` is the largest fused depth."""
+        self._filters, self._step_m = filters, _STEP * depth_max_m
+        self._chosen: list[KeyframeDepth] = []
+        self._steps: list[float] = []
+        self._begin: FloatArray | None = None
+        self._best: tuple[float, KeyframeDepth] | None = None  # with its sharpness
+        self._last: KeyframeDepth | None = None
 
-    return np.searchsorted(flat(keys), flat(wanted))
+    def add(self, view: KeyframeDepth, kept: DepthMap) -> None:
+        """A fused frame with the depth that passed the filters."""
+        if self._begin is not None and has_moved(view.T_world_camera, self._begin, self._step_m, _STEP_DEG):
+            self._close()
+        if self._begin is None:
+            self._begin = view.T_world_camera
+        grey = _grey(view.image)
+        sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var() / (grey.var() + 1.0))  # contrast does not count
+        if self._best is None or sharpness > self._best[0]:
+            self._best = sharpness, replace(view, depth=kept, relative_sigma=None)
+
+    def take(self, camera: Intrinsics) -> dict[str, NDArray[Any]]:
+        """The views since the last call, as fields of a `Submap`."""
+        self._close()
+        views, steps = self._chosen, self._steps
+        self._chosen, self._steps = [], []
+        height, width = camera.height, camera.width
+        return {
+            "T_world_camera": np.array([view.T_world_camera for view in views]).reshape(-1, 4, 4),
+            "images": np.array([view.image for view in views], dtype=np.uint8).reshape(-1, height, width, 3),
+            "depths": np.array([view.depth for view in views], dtype=np.float16).reshape(-1, height, width),
+            "brightness_steps": np.array(steps, dtype=np.float64),
+            "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        }
+
+    def _close(self) -> None:
+        if self._best is not None:
+            _, view = self._best
+            self._steps.append(np.nan if self._last is None else self._brightness_step(view, self._last))
+            self._chosen.append(view)
+            self._last = view
+        self._begin = self._best = None
+
+    def _brightness_step(self, view: KeyframeDepth, before: KeyframeDepth) -> float:
+        """Logarithm of the brightness of surfaces that two views share, over that in the one before."""
+        u, v, z = self._filters.projected(view, before)
+        same = np.abs(sampled(before.depth, u, v) - z) < _SAME_SURFACE * z
+        here, there = (grey[same][::_STRIDE] for grey in (_grey(view.image), sampled(_grey(before.image), u, v)))
+        usable = (np.minimum(here, there) > _DARK) & (np.maximum(here, there) < _BRIGHT)
+        if usable.sum() < _LEAST_SHARED:
+            return float("nan")
+        return float(np.median(np.log(here[usable]) - np.log(there[usable])))
+
+
+def has_moved(T_world_camera: FloatArray, T_world_before: FloatArray, step_m: float, turn_deg: float) -> bool:
+    """Whether a camera has moved by a step or a turn."""
+    T_before_camera = invert(T_world_before) @ T_world_camera
+    turned = float(rotation_angle(T_before_camera[:3, :3]))
+    return float(np.linalg.norm(T_before_camera[:3, 3])) >= step_m or turned >= np.deg2rad(turn_deg)
+
+
+def moved_rows(T_world_camera: FloatArray, step_m: float, turn_deg: float) -> list[int]:
+    """The first of some poses ``(N, 4, 4)``, and each before which the camera has moved since the last chosen one."""
+    chosen: list[int] = []
+    for row, T_next in enumerate(T_world_camera):
+        if not chosen or has_moved(T_next, T_world_camera[chosen[-1]], step_m, turn_deg):
+            chosen.append(row)
+    return chosen
+
+
+def _grey(image: Image) -> FloatArray:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float64)
+
+
+class Painter:
+    """Colours points by the views of all submaps."""
+
+    def __init__(self, submaps: MergedSubmaps, voxel_size_m: float, reach_m: float) -> None:
+        """Even out the exposure of all views."""
+        self._submaps, self._voxel, self._range = submaps, voxel_size_m, reach_m
+        self._gains = np.exp(-evened(submaps.brightness_steps))
+
+    def colours(self, points_world: FloatArray) -> NDArray[np.uint8]:
+        """RGB ``(P, 3)`` of points of the surface ``(P, 3)``; one that no view shows has that of the nearest shown."""
+        total, weight = np.zeros((len(points_world), 3)), np.zeros(len(points_world))
+        low, high = points_world.min(axis=0), points_world.max(axis=0)
+        positions = self._submaps.T_world_views[:, :3, 3]
+        away = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
+        for view in np.flatnonzero(away < self._range):
+            self._add(int(view), points_world, total, weight)
+        shown = weight > 0
+        if not shown.any():
+            return np.full(points_world.shape, _GREY, np.uint8)
+        colours = total / np.where(shown, weight, 1.0)[:, None]
+        if not shown.all():
+            _, nearest = cKDTree(points_world[shown]).query(points_world[~shown])
+            colours[~shown] = colours[shown][nearest]
+        return np.asarray(np.rint(np.clip(colours, 0, 255)), np.uint8)
+
+    def _add(self, view: int, points_world: FloatArray, total: FloatArray, weight: FloatArray) -> None:
+        """Add the colours of one view to those of the points that it shows."""
+        number = int(self._submaps.submap_of_view[view])
+        submap = self._submaps.read(number)
+        own = view - int(np.searchsorted(self._submaps.submap_of_view, number))
+        T_camera_world = invert(self._submaps.T_world_views[view])
+        depth_of_points = points_world @ T_camera_world[2, :3] + T_camera_world[2, 3]
+        ahead = np.flatnonzero(depth_of_points > _NEAREST_VOXELS * self._voxel)
+        x, y, z = apply(T_camera_world, points_world[ahead]).T
+        fx, fy, cx, cy = submap.camera
+        depth, image = submap.depths[own], submap.images[own]
+        u, v = np.rint(fx * x / z + cx), np.rint(fy * y / z + cy)
+        inside = (u >= 0) & (u < depth.shape[1]) & (v >= 0) & (v < depth.shape[0])
+        u, v, z, ahead = u[inside].astype(np.intp), v[inside].astype(np.intp), z[inside], ahead[inside]
+        known = depth[v, u]
+        same = (known > 0) & (np.abs(known - z) < np.maximum(_SAME_VOXELS * self._voxel, _SAME_SURFACE * z))
+        shown, share = ahead[same], z[same] ** -_NEARNESS
+        weight[shown] += share
+        total[shown] += share[:, None] * (self._gains[view] * image[v[same], u[same]])
+
+
+def evened(brightness_steps: FloatArray) -> FloatArray:
+    """Logarithms of the brightness ``(N,)`` of views by the steps between them, as small as these allow.
+
+    Least squares; a step that is NaN couples nothing.
+    """
+    count = len(brightness_steps)
+    if count < 2:
+        return np.zeros(count)
+    steps = brightness_steps[1:]
+    known = np.isfinite(steps)
+    steps = np.where(known, steps, 0.0)
+    banded, right = np.zeros((2, count)), np.zeros(count)
+    banded[1] = _EXPOSURE_PRIOR
+    banded[1, 1:] += known
+    banded[1, :-1] += known
+    banded[0, 1:] = -known.astype(float)
+    right[1:] += steps
+    right[:-1] -= steps
+    solved: FloatArray = solveh_banded(banded, right)
+    return solved

@@ -1,14 +1,17 @@
 """The surface of a whole map, one tile in memory at a time.
 
-Tiles are extracted into a spill file. Vertices that neighbouring tiles share are the same bit by bit; by them pieces of
-surface are followed from tile to tile, small ones are left out, and the files are written with each vertex once.
+A tile is cut from its blocks with a margin so that neighbouring tiles fit without a seam. Small holes of the road are
+closed: flat loops of open edges that look upwards. Tiles are extracted into a spill file. Vertices that neighbouring
+tiles share are the same bit by bit; by them pieces of surface are followed from tile to tile, small ones are left out,
+and the files are written with each vertex once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
@@ -19,11 +22,11 @@ from scipy.sparse.csgraph import connected_components
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
+from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
-from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, MergedSubmaps, SpilledSubmap
-from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile, with_holes_closed
-from slam.mapping.views import Painter
+from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, Keys, MergedSubmaps, Painter, SpilledSubmap, new_grid
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.imports import import_open3d
 from slam.runtime.resources import SpilledArray, SpillFile
 
 _LEAST_WEIGHT = 1.0  # observations of a voxel that becomes surface
@@ -31,6 +34,10 @@ _LEAST_TRIANGLES = 300  # of a connected piece; smaller ones float
 _LENGTHS, _COLOURS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
 VERTEX = np.dtype([*((name, "<f4") for name in _LENGTHS), *((name, "u1") for name in _COLOURS)])
 _FILLED = np.dtype([*VERTEX.descr, ("filled", "u1")])
+Triangles = NDArray[np.int64]
+_UPWARDS = 0.85  # least cosine to the camera's own upwards
+_FLAT = 0.15  # largest height of a hole's edge over its diameter
+_MOST_EDGES = 100
 
 
 @dataclass(frozen=True)
@@ -78,8 +85,20 @@ class MapSurface:
         submaps = MergedSubmaps(finished)
         self._spill = SpillFile("the map")
         self._pieces: list[Piece] = []
-        self.blocks, self.submaps = submaps.block_count(), submaps.count
-        self._extract(submaps, config, progress)
+        self.blocks, self.submaps = submaps.blocks, submaps.count
+        painter = Painter(submaps, config.voxel_size_m, config.reach_m)
+        tiles = submaps.tiles()
+        for done, tile in enumerate(tiles, 1):
+            patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
+            if patch is not None and config.close_holes_m > 0:
+                # upwards in the camera of the view nearest to the tile
+                middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * config.voxel_size_m
+                nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
+                up = -submaps.T_world_views[nearest, :3, 1]
+                patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
+            if patch is not None and patch.own.any():
+                self._pieces.append(_piece(patch, painter, self._spill))
+            progress("mesh", done, len(tiles))
         if not self._pieces:
             raise EmptyMapError("the map is empty: no surface was seen")
         self._rows = _numbered(self._pieces, _LEAST_TRIANGLES, self._spill)
@@ -122,19 +141,6 @@ class MapSurface:
     def write_cloud(self, path: Path) -> None:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
         write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces())
-
-    def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress) -> None:
-        painter = Painter(submaps, config.voxel_size_m, config.reach_m)
-        tiles = submaps.tiles()
-        for done, tile in enumerate(tiles, 1):
-            patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
-            if patch is not None:
-                if config.close_holes_m > 0:
-                    up = _upwards(submaps, tile, config.voxel_size_m)
-                    patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
-                if patch.own.any():
-                    self._pieces.append(_piece(patch, painter, self._spill))
-            progress("mesh", done, len(tiles))
 
 
 def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
@@ -198,9 +204,171 @@ def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> li
     return rows
 
 
-def _upwards(submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float) -> FloatArray:
-    """Upwards ``(3,)`` in the camera of the view nearest to a tile."""
-    middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * voxel_size_m
-    nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
-    up: FloatArray = -submaps.T_world_views[nearest, :3, 1]
-    return up
+@dataclass(frozen=True)
+class TileSurface:
+    """Vertices ``(V, 3)`` in the world, triangles ``(T, 3)``, which of them belong to the tile, which close a hole."""
+
+    vertices: FloatArray
+    triangles: Triangles
+    own: Mask
+    filled: Mask
+
+    def normals(self) -> FloatArray:
+        """Unit normals ``(V, 3)``: means of the triangles around each vertex, by their area."""
+        o3d = import_open3d()
+        vertices = o3d.utility.Vector3dVector(self.vertices)
+        triangles = o3d.utility.Vector3iVector(self.triangles.astype(np.int32))  # others are converted one by one
+        return np.asarray(o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals)
+
+
+def extract_tile(
+    submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float, least_weight: float
+) -> TileSurface | None:
+    """The surface of a tile and of one block around it; None where there is none.
+
+    Both sides of a border between tiles see the same voxels, so that vertices there are the same bit by bit. A triangle
+    belongs to the tile that its centre is in.
+    """
+    low = tile * TILE_BLOCKS
+    mesh = _extract(*submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m, least_weight)
+    if mesh is None:
+        return None
+    vertices, triangles = _sorted(*mesh)
+    own = in_tile(vertices[triangles].mean(axis=1), tile, voxel_size_m)
+    if not own.any():
+        return None
+    return TileSurface(vertices, triangles, own, np.zeros(len(own), dtype=bool))
+
+
+def in_tile(points: FloatArray, tile: NDArray[np.int64], voxel_size_m: float) -> Mask:
+    """Which points ``(P, 3)`` are in a tile."""
+    side = voxel_size_m * BLOCK_SIDE * TILE_BLOCKS
+    return np.asarray((np.floor(points / side) == tile).all(axis=1))
+
+
+def _extract(
+    keys: Keys, tsdf: NDArray[np.float32], weight: NDArray[np.float32], voxel_size_m: float, least_weight: float
+) -> tuple[FloatArray, Triangles] | None:
+    o3d = import_open3d()
+    grid: Any = new_grid(voxel_size_m, len(keys))
+    places, _ = grid.hashmap().activate(o3d.core.Tensor(keys.astype(np.int32)))
+    shape = (len(keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 1)
+    for name, values in (("tsdf", tsdf), ("weight", weight)):
+        grid.attribute(name).numpy()[places.numpy()] = values.reshape(shape)
+    try:
+        # a frame weighs 1
+        mesh = grid.extract_triangle_mesh(least_weight - 0.5)
+    except RuntimeError:  # Open3D cannot build an empty geometry
+        return None
+    if mesh.is_empty() or not len(mesh.triangle.indices):
+        return None
+    return mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy().astype(np.int64)
+
+
+def _sorted(vertices: FloatArray, triangles: Triangles) -> tuple[FloatArray, Triangles]:
+    """The same mesh in an order that does not depend on Open3D's threads."""
+    order = np.lexsort(vertices.T)
+    differs = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
+    if not differs.all():  # several vertices in one place: by the places that the triangles around them reach
+        place = np.empty_like(order)
+        place[order] = np.append(0, np.cumsum(differs))
+        reached = np.zeros(len(vertices), dtype=np.int64)
+        np.add.at(reached, triangles, (place[triangles] ** 2).sum(axis=1)[:, None])  # of integers, in any order
+        order = np.lexsort((reached, *vertices.T))
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    triangles = rank[triangles]
+    first = triangles.argmin(axis=1)[:, None]  # cyclic rotation keeps the orientation of a triangle
+    triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
+    return vertices[order], triangles[np.lexsort(triangles.T[::-1])]
+
+
+def with_holes_closed(
+    patch: TileSurface, tile: NDArray[np.int64], voxel_size_m: float, up_world: FloatArray, largest_m: float
+) -> TileSurface:
+    """Close holes of at most ``largest_m`` across by triangles around a new vertex in their middle.
+
+    Args:
+        patch: the surface.
+        tile: its tile; a hole belongs to the tile that its middle is in.
+        voxel_size_m: of the map.
+        up_world: upwards ``(3,)`` near the tile.
+        largest_m: largest diameter.
+    """
+    vertices, triangles, own = [patch.vertices], [patch.triangles], [patch.own]
+    count = len(patch.vertices)
+    upwards = patch.normals() @ up_world
+    for ring in _rings(patch.triangles, upwards):
+        corners = patch.vertices[ring]
+        middle = corners.mean(axis=0)
+        if not _is_small_and_flat(corners - middle, up_world, largest_m):
+            continue
+        vertices.append(middle[None])
+        triangles.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), count)], axis=1))
+        own.append(np.repeat(in_tile(middle[None], tile, voxel_size_m), len(ring)))
+        count += 1
+    filled = np.concatenate([np.full(len(each), number > 0) for number, each in enumerate(triangles)])
+    return replace(
+        patch,
+        vertices=np.concatenate(vertices),
+        triangles=np.concatenate(triangles),
+        own=np.concatenate(own),
+        filled=filled,
+    )
+
+
+def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: float) -> bool:
+    """Whether a ring ``(R, 3)`` around the origin is the edge of a small hole in ground.
+
+    Its edges run as in the triangles beside them, which go round a hole the other way than round a piece of surface.
+    """
+    if 2 * float(np.linalg.norm(corners, axis=1).max()) > largest_m:
+        return False
+    (x, y, z), (u, v, w) = corners.T, corners[[*range(1, len(corners)), 0]].T
+    area = 0.5 * np.array([y @ w - z @ v, z @ u - x @ w, x @ v - y @ u])
+    size = float(np.linalg.norm(area))
+    if size == 0 or float(-area @ up_world) < _UPWARDS * size:
+        return False
+    return float(np.abs(corners @ area).max()) <= _FLAT * largest_m * size
+
+
+def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]:
+    """Closed rings of open edges, each vertex once, in the direction of the triangles beside them.
+
+    Those of at most 100 edges whose vertices look upwards in the mean; ``upwards`` ``(V,)`` are cosines.
+    """
+    vertices = len(upwards)
+    begin, end = _open_edges(triangles, vertices)
+    simple = (np.bincount(begin, minlength=vertices) == 1) & (np.bincount(end, minlength=vertices) == 1)
+    link = coo_array((np.ones(len(begin), dtype=bool), (begin, end)), shape=(vertices, vertices))
+    _, label = connected_components(link, directed=False)
+    broken = np.zeros(vertices, dtype=bool)  # rings that touch themselves
+    touched = np.zeros(vertices, dtype=bool)
+    touched[begin] = touched[end] = True
+    broken[label[touched & ~simple]] = True
+    edges_of = np.bincount(label[begin], minlength=vertices)
+    upwards_of = np.bincount(label[begin], weights=upwards[begin], minlength=vertices)
+    broken |= (edges_of > _MOST_EDGES) | (upwards_of < _UPWARDS * edges_of)
+    following = np.full(vertices, -1, dtype=np.int64)
+    following[begin] = end
+    chosen = begin[~broken[label[begin]]]
+    _, first = np.unique(label[chosen], return_index=True)
+    rings = []
+    for start in chosen[np.sort(first)].tolist():
+        ring = [start]
+        while (vertex := int(following[ring[-1]])) != start:
+            ring.append(vertex)
+        rings.append(np.array(ring, dtype=np.int64))
+    return rings
+
+
+def _open_edges(triangles: Triangles, vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Begins and ends of the edges of one triangle alone, in its direction."""
+    begin, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    codes = np.sort(2 * (low * vertices + high) + (begin > end))  # sorting numbers alone is fast
+    is_new = np.concatenate([[True], codes[1:] // 2 != codes[:-1] // 2, [True]])
+    codes = codes[is_new[1:] & is_new[:-1]]
+    low, high = np.divmod(codes // 2, vertices)
+    is_down = codes % 2 == 1
+    return np.where(is_down, high, low), np.where(is_down, low, high)

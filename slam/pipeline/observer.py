@@ -24,7 +24,7 @@ from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
 from slam.loops.descriptors import FeatureExtractor
-from slam.pipeline.keyframe_tracking import KeyframeTracking
+from slam.pipeline.keyframe_maps import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.resources import SpillFile, Stopwatch, return_freed_memory
 
@@ -187,7 +187,12 @@ class Observer:
         self._snippet_frames = (*self._snippet_frames, frame)[-sources - 1 :]
         # what was measured two frames ago is finished, whatever else is
         by_keyframes, step = self.keyframes.measures(drive, index - 2), drive.last_step(index - 2)
-        has_moved = step is not None and self._has_moved_on(step, index + 1 - self._depth_index)
+        has_moved = False  # whether as many more steps as this one leave what the last predicted depth shows
+        if step is not None:
+            roads = drive.roads[: step.ends[1] + 1][-_LAST_ROADS:]
+            height = next((height for road in reversed(roads) if (height := height_of(road)) is not None), math.inf)
+            way = (index + 1 - self._depth_index) * step.length_unscaled
+            has_moved = way > _MOVED_ON_HEIGHTS * height
         after_frozen = drive.repeated[-1:] == [index - 1]  # what it hid is not carried
         wants_depth = not by_keyframes and (step is None or has_moved or index % stride == 0 or after_frozen)
         is_dense = not by_keyframes and (step is None or stride == 1)
@@ -198,12 +203,6 @@ class Observer:
         if wants_snippet:
             asked.snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
         return asked
-
-    def _has_moved_on(self, step: Motion, frames: int) -> bool:
-        """Whether so many more steps as this one leave what the last predicted depth shows."""
-        roads = self.drive.roads[: step.ends[1] + 1][-_LAST_ROADS:]
-        height = next((height for road in reversed(roads) if (height := height_of(road)) is not None), math.inf)
-        return frames * step.length_unscaled > _MOVED_ON_HEIGHTS * height
 
     def _predict(self, frame: Frame) -> Future[DepthMap]:
         """Depth ``(H, W)`` of a frame, by the networks' thread; ``SlamError`` where a user's predictor errs."""

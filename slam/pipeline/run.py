@@ -41,12 +41,11 @@ from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checks import require_possible, warn_of_doubts, warn_of_images
-from slam.pipeline.estimate import Estimate, Odometry
-from slam.pipeline.fusion import fuse
-from slam.pipeline.map_closure import close_maps
+from slam.pipeline.estimate import Estimate, Odometry, fuse
+from slam.pipeline.keyframe_maps import close_maps
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside

@@ -22,8 +22,20 @@ from erfsfm.evaluation.pose_metrics import (
     snippets_from_trajectory,
 )
 from slam.evaluation.depth import DepthErrors
-from slam.evaluation.map import ERRORS, OUTLIER_M, PlacedMetrics, compare, placed_errors, pose_similarity
-from slam.evaluation.surface import RANGE_M, Indices, Surface, SurfaceTruth, backprojected, stretches
+from slam.evaluation.map import (
+    ERRORS,
+    OUTLIER_M,
+    RANGE_M,
+    Indices,
+    PlacedMetrics,
+    Surface,
+    SurfaceTruth,
+    backprojected,
+    compare,
+    placed_errors,
+    pose_similarity,
+    stretches,
+)
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.frames import DepthMap, Intrinsics, Mask, RelativePose, runs
@@ -34,7 +46,7 @@ from slam.frontend.lidar_odometry import LidarPath, readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert, umeyama
 from slam.graph.pose_graph import whitened_squared
 from slam.loops.closure import MOST_REJECTED, LoopClosures
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.pipeline.estimate import Estimate
 from slam.results import metrics as records
 from slam.results.metrics import DepthOfKeyframes, Metrics

@@ -39,7 +39,7 @@ from slam.sequences.recording import (
     require_stamps,
     uniform_stamps,
 )
-from slam.simulation.surface import distances, scene_of
+from slam.simulation.world import distances, scene_of
 
 logger = logging.getLogger(__name__)
 

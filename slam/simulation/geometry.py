@@ -59,19 +59,15 @@ class Soup:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._vertices: list[FloatArray] = []
-        self._triangles: list[IntArray] = []
-        self._uv: list[FloatArray] = []
-        self._instance: list[IntArray] = []
-        self._materials: list[int] = []
-        self._colours: list[FloatArray] = []
-        self._parameters: list[FloatArray] = []
-        self._count = 0
+        # vertices, triangles, their texture coordinates and instances, patch by patch
+        self._patches: list[tuple[FloatArray, IntArray, FloatArray, IntArray]] = []
+        self._looks: list[tuple[int, FloatArray, FloatArray]] = []  # material, colours and parameters, by instance
+        self._count = 0  # of vertices
 
     @property
     def instances(self) -> int:
         """Number of registered instances."""
-        return len(self._materials)
+        return len(self._looks)
 
     def instance(
         self,
@@ -83,18 +79,14 @@ class Soup:
         """Register an instance with its colours and parameters; return its number."""
         row = np.zeros(PARAMETERS)
         row[: len(parameters)] = parameters
-        self._materials.append(int(material))
-        self._colours.append(np.stack([colour, colour if colour2 is None else colour2]))
-        self._parameters.append(row)
-        return len(self._materials) - 1
+        self._looks.append((int(material), np.stack([colour, colour if colour2 is None else colour2]), row))
+        return len(self._looks) - 1
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
         """Add a grid of quads: vertices in the plan ``(R, C, 3)`` and texture coordinates in metres ``(R, C, 2)``."""
         triangles = _patch_triangles(points.shape[0], points.shape[1])
-        self._vertices.append(points.reshape(-1, 3))
-        self._uv.append(uv.reshape(-1, 2)[triangles])
-        self._triangles.append(triangles + self._count)
-        self._instance.append(np.full(len(triangles), instance))
+        of_triangles = triangles + self._count, uv.reshape(-1, 2)[triangles], np.full(len(triangles), instance)
+        self._patches.append((points.reshape(-1, 3), *of_triangles))
         self._count += points.shape[0] * points.shape[1]
 
     def quad(self, corner: FloatArray, along: FloatArray, up: FloatArray, instance: int) -> None:
@@ -105,9 +97,9 @@ class Soup:
 
     def finish(self, bend: "Bend") -> Mesh:
         """Bend every vertex from plan to street coordinates and drop triangles without area."""
-        vertices = bend(np.concatenate(self._vertices))
-        triangles, uv = np.concatenate(self._triangles), np.concatenate(self._uv)
-        instance = np.concatenate(self._instance)
+        vertices, triangles, uv, instance = map(np.concatenate, zip(*self._patches))
+        vertices = bend(vertices)
+        materials, colours, parameters = (np.array(table) for table in zip(*self._looks))
         corners = vertices[triangles]  # (T, 3, 3)
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         normals = np.cross(edge1, edge2)
@@ -118,7 +110,6 @@ class Soup:
         tangents = (edge1 * uv2[:, 1:] - edge2 * uv1[:, 1:]) * np.sign(determinant)[:, None]
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
         normals /= np.maximum(area, 1e-9)[:, None]
-        count = len(self._materials)
         return Mesh(
             vertices=vertices.astype(np.float32),
             triangles=triangles[keep].astype(np.uint32),
@@ -126,10 +117,10 @@ class Soup:
             normals=_last(normals[keep]),
             tangents=_last(tangents[keep]),
             instance=instance[keep].astype(np.int32),
-            material=np.array(self._materials, dtype=np.int8)[instance[keep]],
-            colours=_last(np.stack(self._colours)),
-            parameters=_last(np.stack(self._parameters)),
-            offsets=_last(self._rng.uniform(0.0, 200.0, (count, 2))),
+            material=materials.astype(np.int8)[instance[keep]],
+            colours=_last(colours),
+            parameters=_last(parameters),
+            offsets=_last(self._rng.uniform(0.0, 200.0, (self.instances, 2))),
         )
 
 

@@ -1,29 +1,43 @@
-"""An embedded street world: images, exact depth, exact poses and LiDAR scans of a simulated drive.
+"""An embedded street world: images, exact depth, exact poses and LiDAR scans of a drive under a sky, with hazards.
 
 Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/simulation``).
 """
 
 import functools
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from slam.frames import Intrinsics
+from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation import hazards as effects
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
-from slam.simulation.hazards import Traffic
-from slam.simulation.light import draw_varied_weather, draw_weather, paint, sky
-from slam.simulation.objects import bonnet
-from slam.simulation.options import SimulationOptions
-from slam.simulation.route import plan_route
-from slam.simulation.sensors import KITTI_CAMERA, T_CAMERA_LIDAR, beam_directions, measured, square_camera
-from slam.simulation.surface import Hits, Surface, place_rays
+from slam.simulation.objects import bonnet, car, frame_at
+from slam.simulation.options import SimulationOptions, draw_variety
+from slam.simulation.route import STEP, Route, plan_route
+from slam.simulation.texture import Texels, fractal
 from slam.simulation.town import build_town
-from slam.simulation.variety import draw_variety
-from slam.simulation.world import SimulatedWorld, in_bytes, through_lens
+from slam.simulation.world import SHUTTER, Hits, SimulatedWorld, Surface, place_rays, square_camera, through_lens
 
+# KITTI odometry 00-02 (rectified colour camera), at the size it was recorded at
+KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
+STILL_FRAMES = 30  # of a stop: 3 s at 10 frames a second
+BLUR_SAMPLES = 6
+WIDEST_LANE_M = 2.0  # from its middle to its edge
 _DARKEST_MEAN = 0.33  # of an image, to which a camera exposes at least
+
+BEAMS, COLUMNS = 64, 850
+HIGHEST_DEG, LOWEST_DEG = 2.0, -24.8
+NEAREST_M, FARTHEST_M = 2.0, 90.0
+RANGE_NOISE_M, ELEVATION_NOISE = 0.02, 1e-3
+
+# LiDAR: x forward, y left, z up; 8 cm above and 27 cm behind the camera, as on KITTI's car
+T_CAMERA_LIDAR: FloatArray = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -0.08], [1.0, 0.0, 0.0, -0.27], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 class SimulatedStreet(SimulatedWorld):
@@ -35,7 +49,7 @@ class SimulatedStreet(SimulatedWorld):
     def __init__(self, options: SimulationOptions) -> None:
         """Plan the drive; ``SequenceError`` where there are too few frames for the route."""
         size = options.width, options.height
-        still = effects.STILL_FRAMES if "stop" in options.hazards else 0
+        still = STILL_FRAMES if "stop" in options.hazards else 0
         variety = draw_variety(options.seed, options.route == "straight") if options.varied else None
         camera = KITTI_CAMERA.resized(*size) if variety is None else variety.camera(*size)
         if options.fov_deg is not None:
@@ -46,14 +60,26 @@ class SimulatedStreet(SimulatedWorld):
         self.T_camera_lidar = T_CAMERA_LIDAR.copy()
         self._variety = variety
         self._weather = draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
-        self._exposure = effects.exposure_curve(options.seed, options.frames)
+        rng = np.random.default_rng([options.seed, 31])
+        self._exposure = np.empty((options.frames, 2))  # gain and gamma of every frame, piecewise constant
+        start = 0
+        while start < options.frames:
+            stop = start + int(rng.integers(12, 45))
+            self._exposure[start:stop] = rng.uniform(0.55, 1.5), rng.uniform(0.75, 1.3)
+            start = stop
         self._traffic = Traffic(self._route, options.seed, options.varied) if "moving-cars" in options.hazards else None
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
         self._require(index)
         rng = np.random.default_rng([self.options.seed, 40, index])
-        directions = beam_directions(rng)
+        # each spin starts at a random angle: with the same rays in every scan the rings on the ground would repeat
+        # exactly, and scan matching would estimate zero motion
+        azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
+        elevation = np.deg2rad(np.linspace(HIGHEST_DEG, LOWEST_DEG, BEAMS))[:, None]
+        elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
+        x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+        directions = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3).astype(np.float32)
         T_street_lidar = self._route.T_street_camera[index] @ self.T_camera_lidar
         rays = place_rays(T_street_lidar, directions)
         ranges = np.full(len(rays), np.inf, dtype=np.float32)
@@ -64,7 +90,9 @@ class SimulatedStreet(SimulatedWorld):
             ranges[nearer] = answer["t_hit"][nearer]
             instance = surface.mesh.instance[answer["primitive_ids"][nearer]]
             reflectance[nearer] = surface.mesh.colours[0][:, instance].mean(axis=0)
-        return measured(directions, ranges, reflectance, rng)
+        returned = (ranges > NEAREST_M) & (ranges < FARTHEST_M)
+        noisy = ranges[returned] + rng.normal(0.0, RANGE_NOISE_M, int(returned.sum()))
+        return np.column_stack([directions[returned] * noisy[:, None], reflectance[returned]]).astype(np.float32)
 
     def _build(self) -> Mesh:
         return build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied)
@@ -93,36 +121,205 @@ class SimulatedStreet(SimulatedWorld):
         return max(1.0 / brightest, _DARKEST_MEAN / float(np.mean(np.minimum(views, brightest))))
 
     def _exposures(self, index: int) -> FloatArray:
+        T_street_camera = self._route.T_street_camera
         if "blur" in self.options.hazards:
-            return effects.shutter_poses(self._route.T_street_camera, index)
-        return self._route.T_street_camera[index : index + 1]
+            # poses while the shutter is open around a frame; all one pose at a stop
+            low, high = max(index - 1, 0), min(index + 1, len(T_street_camera) - 1)
+            here = T_street_camera[index]
+            T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
+            turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
+            if np.array_equal(here, T_street_camera[high]):
+                return np.repeat(here[None], BLUR_SAMPLES, axis=0)
+            fraction = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
+            fraction *= SHUTTER / (high - low)
+            motion = fraction[:, None] * turn, fraction[:, None] * T_low_high[:3, 3]
+            return np.asarray(here @ se3.from_rotation_vector(*motion))
+        return T_street_camera[index : index + 1]
 
     def _background(self, directions: Float32Array) -> Float32Array:
-        return sky(self._weather, directions)
+        weather, up = self._weather, np.clip(directions[2], 0.0, 1.0)
+        rgb = weather.horizon[:, None] + np.sqrt(up) * (weather.zenith - weather.horizon)[:, None]
+        plane = directions[:2] / (up + 0.12)
+        still = np.zeros_like(up)
+        size = 0.006 / (up + 0.12)
+        texels = Texels(plane[0], plane[1], size, size, still, still)
+        cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
+        fraction = np.clip(1.6 * cover, 0.0, 0.85)
+        white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
+        return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
 
     def _shade(
         self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
     ) -> Float32Array:
-        towards = np.flatnonzero(self._weather.sun @ hits.normals > 0.0)
+        weather, mesh = self._weather, surfaces[number].mesh
+        towards = np.flatnonzero(weather.sun @ hits.normals > 0.0)
         to_sun = np.take(rays, towards, axis=0)
         to_sun[:, :3] += to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
-        to_sun[:, 3:] = self._weather.sun
+        to_sun[:, 3:] = weather.sun
         tensor = import_open3d().core.Tensor(to_sun)
         shadow = np.any([surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0)
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
         lit[pixels[towards]] = 1.0 - shadow
         soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))  # over neighbouring pixels
         lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
-        return paint(surfaces[number].mesh, hits, lit, self._weather, self.camera.fx)
+        rgb = surfaces[number].unlit(hits, self.camera.fx)
+        if weather.contrast != 1.0:
+            base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
+            rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
+        direct = weather.sunshine * np.clip(weather.sun @ hits.normals, 0.0, 1.0) * lit
+        around = weather.ambient * (0.78 + 0.22 * hits.normals[2])
+        warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
+        cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
+        rgb *= np.asarray(direct * warm + around * cool, dtype=np.float32)  # irradiance
+        haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+        return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
 
-    def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
-        """Rain, lens blur, exposure, and quantisation to 8 bits."""
+    def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
+        """Rain, lens blur and exposure."""
         rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
-            rgb = effects.rained_on(rgb, self.options.seed, index)
+            rgb = rained_on(rgb, self.options.seed, index)
         rgb = through_lens(rgb) if self._variety is None else through_lens(rgb, self._variety.blur_px)
         if "exposure" in self.options.hazards:
-            rgb = effects.exposed(rgb, float(self._exposure[index, 0]), float(self._exposure[index, 1]))
+            gain, gamma = self._exposure[index].tolist()
+            rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
         if self._variety is not None:
-            rgb = effects.sensed(rgb, self._variety.vignette, self._variety.noise, self.options.seed, index)
-        return in_bytes(rgb)
+            y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
+            falloff = 1.0 - np.float32(0.5 * self._variety.vignette) * (x * x + (y * y)[:, None])
+            grain = np.random.default_rng([self.options.seed, 35, index]).standard_normal(rgb.shape, dtype=np.float32)
+            rgb = np.asarray(rgb * falloff[..., None] + np.float32(self._variety.noise) * grain)
+        return rgb
+
+
+def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
+    """Rain streaks and reduced contrast over an image ``(H, W, 3)`` about [0, 1]."""
+    rng = np.random.default_rng([seed, 32, index])
+    height, width = rgb.shape[:2]
+    drops = (rng.random((height, width)) < 0.005).astype(np.float32) * rng.uniform(0.4, 1.0)
+    length = max(3, height // 11)
+    kernel = np.zeros((length, length), dtype=np.float32)
+    slant = float(rng.uniform(-0.3, 0.3))
+    for row in range(length):
+        kernel[row, int(length / 2 + slant * (row - length / 2))] = 1.0
+    streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
+    veiled = rgb * 0.85 + 0.07
+    return np.asarray(veiled + streaks * (0.85 - veiled), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Weather:
+    """How a world is lit."""
+
+    sun: Float32Array  # unit direction towards the sun, street frame, (3,)
+    sunshine: float  # strength of the direct light, 0 overcast
+    ambient: float  # strength of the light from everywhere
+    zenith: Float32Array  # colour of the sky overhead, (3,)
+    horizon: Float32Array  # colour of the sky low down, and of the haze, (3,)
+    clouds: float  # cover, 0 to 1
+    visibility_m: float  # distance at which the haze has taken 63 %
+    exposure: float | None  # gain of the camera; None sets it so that a share of the pixels saturates
+    saturated: float = 0.0  # that share
+    contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
+
+
+def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatArray:
+    """Its direction at an elevation in radians, ``(3,)``."""
+    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lowest, highest)
+    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.array(sun)
+
+
+def draw_weather(seed: int) -> Weather:
+    """Weather of a world."""
+    rng = np.random.default_rng([seed, 20])
+    sun = _draw_sun(rng, 0.5, 1.1)
+    sunshine = float(rng.uniform(0.25, 0.75))
+    return Weather(
+        sun=sun.astype(np.float32),
+        sunshine=sunshine,
+        ambient=0.95 - 0.6 * sunshine,
+        zenith=(np.array([0.38, 0.56, 0.85]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
+        horizon=(np.array([0.80, 0.84, 0.88]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
+        clouds=float(rng.uniform(0.0, 1.0)),
+        visibility_m=float(rng.uniform(220.0, 600.0)),
+        exposure=float(rng.uniform(0.95, 1.2)),
+    )
+
+
+def draw_varied_weather(seed: int) -> Weather:
+    """Weather of a varied world: three in four have a sun beside which shadows are 3 to 10 times as dark."""
+    rng = np.random.default_rng([seed, 21])
+    sun = _draw_sun(rng, 0.3, 1.15)
+    sunny = rng.random() < 0.75
+    ambient = 1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0)))) if sunny else float(rng.uniform(0.6, 0.95))
+    bright = float(rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4))
+    blue = np.array([0.30, 0.52, 0.85]) + rng.uniform(-0.08, 0.08, 3)
+    return Weather(
+        sun=sun.astype(np.float32),
+        sunshine=(1.0 - ambient) / sun[2],  # a level road has 1 in the sun
+        ambient=ambient,
+        zenith=(bright * blue).astype(np.float32),
+        horizon=(bright * (np.array([0.80, 0.86, 0.92]) + rng.uniform(-0.08, 0.08, 3))).astype(np.float32),
+        clouds=float(rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0)),
+        visibility_m=float(rng.uniform(300.0, 1500.0)),
+        exposure=None,
+        saturated=float(rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04)),
+        contrast=float(rng.uniform(1.2, 3.0)),
+    )
+
+
+class Traffic:
+    """Moving cars: one ahead of the camera for a while, others oncoming; some overtake it if wanted."""
+
+    def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
+        rng = np.random.default_rng([seed, 33])
+        self._route = drive
+        # offset in lane samples, per frame, to the left in metres, along the lane or against it
+        self._courses: list[tuple[float, float, float, float]] = []
+        meets = float(rng.uniform(4.0, 15.0))
+        while meets < len(drive.sample):
+            speed = -float(rng.uniform(0.7, 1.2)) / STEP
+            start = float(drive.sample[int(meets)]) - speed * meets
+            self._courses.append((start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3)), -1.0))
+            meets += float(rng.uniform(12.0, 40.0))
+        if overtaking:
+            self._plan_passing(np.random.default_rng([seed, 34]))
+        self._gap = float(rng.uniform(9.0, 14.0)) / STEP
+        self._leader_leaves = float(rng.uniform(0.4, 0.8)) * len(drive.sample)
+        makers = [lambda soup: car(soup, rng, frame_at(0.0, 0.0, 0.0))] * (1 + len(self._courses))
+        self._cars = Moving(rng, makers)
+
+    def _plan_passing(self, rng: np.random.Generator) -> None:
+        """Courses of cars on the camera's left, and of slower ones on its right."""
+        for _ in range(max(1, len(self._route.sample) // 12)):
+            beside = int(rng.integers(len(self._route.sample)))
+            left = rng.random() < 0.75
+            speed = float(rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
+            lanes = float(rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9))
+            left_m = min(self._route.lane_offset_m, WIDEST_LANE_M) * lanes
+            self._courses.append((float(self._route.sample[beside]) - speed * beside, speed, left_m, 1.0))
+
+    def placed(self, index: int) -> list[Mesh]:
+        """The cars within sight at a frame, in the street frame."""
+        camera = self._route.T_street_camera[index, :3, 3]
+        # the one in the camera's lane keeps its distance, until it drives away
+        faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
+        T_street_cars = [self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)]
+        T_street_cars += [self._at(start + speed * index, left_m, way) for start, speed, left_m, way in self._courses]
+        there = {number: T_street_car for number, T_street_car in enumerate(T_street_cars) if T_street_car is not None}
+        away = {number: np.linalg.norm(T_street_car[:3, 3] - camera) for number, T_street_car in there.items()}
+        # nearer only where the drive crosses itself
+        return self._cars.placed({number: there[number] for number in there if 2.6 < away[number] < 120.0})
+
+    def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
+        """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""
+        lane = self._route.lane_street
+        k = int(np.floor(sample))
+        if not 2 <= k < len(lane) - 3:
+            return None
+        ahead = sense * (lane[k + 2] - lane[k - 2])
+        ahead /= np.linalg.norm(ahead)
+        left = np.cross([0.0, 0.0, 1.0], ahead)
+        left /= np.linalg.norm(left)
+        position = lane[k] + (sample - k) * (lane[k + 1] - lane[k]) + sense * left_m * left
+        return se3.make(np.stack([ahead, left, np.cross(ahead, left)], axis=1), position)

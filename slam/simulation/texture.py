@@ -280,21 +280,12 @@ def _kerb(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
 
 def _mottled(*octaves: tuple[float, float, float]) -> Shader:
     """Two colours blended by noise."""
-
-    def shader(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-        fraction = np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2)
-        return mix(colours[0], colours[1], fraction)
-
-    return shader
+    return lambda texels, colours, _: mix(colours[0], colours[1], np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2))
 
 
 def _grained(*octaves: tuple[float, float, float]) -> Shader:
     """One colour under noise."""
-
-    def shader(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-        return np.asarray(colours[0] * (1.0 + fractal(texels, *octaves)))
-
-    return shader
+    return lambda texels, colours, _: np.asarray(colours[0] * (1.0 + fractal(texels, *octaves)))
 
 
 def _wall(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:

@@ -4,7 +4,7 @@ import numpy as np
 
 from slam.simulation import objects
 from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
-from slam.simulation.streets import StreetPlan
+from slam.simulation.route import StreetPlan
 
 KERB = 0.13  # height of pavements above the road, metres
 LANE = 3.6  # width on a motorway, metres
@@ -76,14 +76,11 @@ class _Town:
                 rectangle = (x - half, y - half, x + half, y + half)
                 self._slab(rectangle, 0.0 if crossed else KERB, self.junction if crossed else self.grass)
                 if crossed:
-                    self._corner_fill(x, y)
-
-    def _corner_fill(self, x: float, y: float) -> None:
-        """Asphalt outside the rounded kerbs at a junction, and a hair lower where it runs below the blocks."""
-        near, reach = self.plan.half_width, self.plan.half_width + ROUNDING
-        for x0, x1 in ((x - reach, x - near), (x + near, x + reach)):
-            for y0, y1 in ((y - reach, y - near), (y + near, y + reach)):
-                self._slab((x0, y0, x1, y1), -0.005, self.junction)
+                    # asphalt outside the rounded kerbs, and a hair lower where it runs below the blocks
+                    reach = half + ROUNDING
+                    for x0, x1 in ((x - reach, x - half), (x + half, x + reach)):
+                        for y0, y1 in ((y - reach, y - half), (y + half, y + reach)):
+                            self._slab((x0, y0, x1, y1), -0.005, self.junction)
 
     def _corridor(self, rectangle: Rectangle, a: tuple[int, int], b: tuple[int, int]) -> None:
         """A stretch of road between two junctions, or the grass that lies there instead."""
@@ -179,12 +176,9 @@ class _Town:
                 spot = start + along * ahead - 0.95 * inward
                 objects.car(self.soup, rng, objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)))
             along += float(rng.uniform(5.4, 7.5))
-        if self.more is not None:
-            self._furnish_more(self.more, start, end)
-
-    def _furnish_more(self, rng: np.random.Generator, start: FloatArray, end: FloatArray) -> None:
-        """A railing along a part of the kerb, thin posts, and people on the pavement."""
-        length, ahead, inward, angle = _directed(start, end)
+        if self.more is None:
+            return
+        rng = self.more  # a railing along a part of the kerb, thin posts, and people on the pavement
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
             foot = start + first * ahead + float(rng.uniform(0.2, 0.8)) * inward

@@ -1,4 +1,7 @@
-"""A simulated world: surfaces that rays meet, a camera that moves among them, and the truth about both."""
+"""A simulated world: surfaces that rays meet, a camera that moves among them, and the truth about both.
+
+Rays are cast with Open3D; surfaces have a colour where they are met.
+"""
 
 import functools
 from abc import ABC, abstractmethod
@@ -11,11 +14,105 @@ from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.geometry import se3
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.runtime.imports import import_open3d
+from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
 from slam.simulation.options import SimulationOptions
-from slam.simulation.surface import Hits, Surface, distances, facing_normals, place_rays
+from slam.simulation.texture import SHADERS, Texels
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
+SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
+
+
+class Surface:
+    """A mesh and its ray casting scene."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh, self.scene = mesh, scene_of(mesh.vertices, mesh.triangles)
+
+    def cast(self, rays: Float32Array) -> dict[str, NDArray[Any]]:
+        """Where rays ``(N, 6)`` meet it: ``t_hit`` (infinite if nowhere), triangle and barycentric weights."""
+        answer = self.scene.cast_rays(import_open3d().core.Tensor(rays))
+        return {name: answer[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")}
+
+    def unlit(self, hits: "Hits", focal_px: float) -> Float32Array:
+        """Colour of each hit under white light, ``(3, N)`` at a focal length in pixels."""
+        mesh = self.mesh
+        tangents = np.take(mesh.tangents, hits.triangle, axis=1)
+        u_size, v_size = _footprint(hits.depth / np.float32(focal_px), hits.rays, hits.normals, tangents)
+        corners = np.take(mesh.uv, hits.triangle, axis=2)  # (3, 2, N)
+        b1, b2 = hits.barycentric
+        u, v = corners[0] + b1 * (corners[1] - corners[0]) + b2 * (corners[2] - corners[0])
+        instance = np.take(mesh.instance, hits.triangle)
+        offsets = np.take(mesh.offsets, instance, axis=1)
+        counts = np.bincount(np.take(mesh.material, hits.triangle), minlength=len(Material))
+        ends = np.cumsum(counts)
+        rgb = np.empty((3, len(hits.triangle)), dtype=np.float32)
+        for kind in np.flatnonzero(counts):
+            part = slice(int(ends[kind] - counts[kind]), int(ends[kind]))
+            texels = Texels(u[part], v[part], u_size[part], v_size[part], offsets[0, part], offsets[1, part])
+            colours = np.take(mesh.colours, instance[part], axis=2)
+            parameters = np.take(mesh.parameters, instance[part], axis=1)
+            rgb[:, part] = SHADERS[Material(kind)](texels, colours, parameters)
+        return rgb
+
+
+def scene_of(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Any:
+    """Open3D's scene of triangles ``(T, 3)`` between vertices ``(V, 3)``."""
+    open3d = import_open3d()
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles))
+    return scene
+
+
+def distances(scene: Any, points: FloatArray) -> FloatArray:
+    """Distance from points ``(M, 3)`` to the nearest surface of a scene, ``(M,)``."""
+    tensor = import_open3d().core.Tensor(points.astype(np.float32))
+    return np.asarray(scene.compute_distance(tensor).numpy(), dtype=np.float64)
+
+
+def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32Array:
+    """Origin and direction in the scene of directions ``(N, 3)`` in a sensor's frame, ``(N, 6)``.
+
+    Of several poses ``(H, 4, 4)`` each is that of an equal share of the directions in turn, as of the rows of an image.
+    """
+    rays = np.empty((len(directions), 6), dtype=np.float32)
+    if T_scene_sensor.ndim == 3:
+        by_row = directions.reshape(len(T_scene_sensor), -1, 3)
+        rays[:, :3] = np.repeat(T_scene_sensor[:, :3, 3], by_row.shape[1], axis=0)
+        rays[:, 3:] = (by_row @ T_scene_sensor[:, :3, :3].swapaxes(1, 2).astype(np.float32)).reshape(-1, 3)
+        return rays
+    rays[:, :3] = T_scene_sensor[:3, 3]
+    rays[:, 3:] = directions @ T_scene_sensor[:3, :3].T.astype(np.float32)
+    return rays
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Rays that met a mesh, sorted by material."""
+
+    triangle: NDArray[np.int64]  # which, (N,)
+    barycentric: Float32Array  # weights of its second and third corner, (2, N)
+    rays: Float32Array  # unit directions in the mesh's frame, (3, N)
+    normals: Float32Array  # unit, turned towards the viewer, (3, N)
+    depth: Float32Array  # z-depth, metres, (N,)
+    distance: Float32Array  # along the ray, metres, (N,)
+
+
+def _footprint(
+    pixel: Float32Array, rays: Float32Array, normals: Float32Array, tangents: Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """Extent of a pixel on a surface along its u and v axes, grazing angle included.
+
+    A round pixel of size f ``(N,)``, metres at the surface's distance, seen by rays at angle a to the normals is an
+    ellipse of axes f and f / cos a; along a tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a). All directions are
+    unit, ``(3, N)``.
+    """
+    cosine = np.abs((rays * normals).sum(axis=0))
+    along_u = (rays * tangents).sum(axis=0)
+    cosine2 = np.maximum(cosine * cosine, 1e-4)
+    u2 = along_u * along_u
+    v2 = np.maximum(1.0 - cosine * cosine - u2, 0.0)
+    return pixel * np.sqrt(1.0 + u2 / cosine2), pixel * np.sqrt(1.0 + v2 / cosine2)
 
 
 @dataclass(frozen=True)
@@ -76,8 +173,8 @@ class SimulatedWorld(ABC):
         """Poses from which the image is taken, which is their mean: ``(S, 4, 4)``, or ``(S, H, 4, 4)``, one a row."""
 
     @abstractmethod
-    def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
-        """The image of light ``(H, W, 3)`` that fell on the sensor."""
+    def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
+        """The image, about [0, 1], of light ``(H, W, 3)`` that fell on the sensor."""
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -92,8 +189,9 @@ class SimulatedWorld(ABC):
             rgb, depth = next(views)
         else:
             rgb, depth = np.mean([view[0] for view in views], axis=0), self.depth(index)
-        stamp = index / self.options.rate
-        return SimulatedFrame(index, stamp, self._develop(rgb, index), depth, self.T_world_camera[index].copy())
+        levels = self._develop(rgb, index) * np.float32(255.0) + np.float32(0.5)
+        image = np.clip(levels, 0.0, 255.0).astype(np.uint8)
+        return SimulatedFrame(index, index / self.options.rate, image, depth, self.T_world_camera[index].copy())
 
     def depth(self, index: int) -> Float32Array:
         """The z-depth ``(H, W)`` of `render`, without the image."""
@@ -120,11 +218,11 @@ class SimulatedWorld(ABC):
 
     @functools.cached_property
     def _still(self) -> Surface:
-        return Surface.of(self._build())
+        return Surface(self._build())
 
     def _surfaces(self, index: int) -> list[Surface]:
         """The surfaces at a frame: what stands still, and what moves."""
-        return [self._still, *map(Surface.of, self._moving(index))]
+        return [self._still, *map(Surface, self._moving(index))]
 
     def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or from one of each row."""
@@ -142,11 +240,13 @@ class SimulatedWorld(ABC):
             triangle = answer["primitive_ids"][seen].astype(np.int64)
             order = np.argsort(np.take(surface.mesh.material, triangle), kind="stable")
             seen, triangle = seen[order], triangle[order]
+            rays_seen = np.take(unit, seen, axis=1)
+            normals = np.take(surface.mesh.normals, triangle, axis=1)
             hits = Hits(
                 triangle=triangle,
                 barycentric=np.take(answer["primitive_uvs"], seen, axis=0).T,
-                rays=np.take(unit, seen, axis=1),
-                normals=facing_normals(surface.mesh, triangle, np.take(unit, seen, axis=1)),
+                rays=rays_seen,
+                normals=np.asarray(normals * -np.sign((normals * rays_seen).sum(axis=0))),  # turned towards the viewer
                 depth=depth[seen],
                 distance=depth[seen] * self._stretch[seen],
             )
@@ -159,11 +259,12 @@ class SimulatedWorld(ABC):
             raise IndexError(f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}")
 
 
+def square_camera(width: int, height: int, fov_deg: float) -> Intrinsics:
+    """Of square pixels with a horizontal field of view, its centre in the middle."""
+    focal_px = float(0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg)))
+    return Intrinsics(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))
+
+
 def through_lens(rgb: Float32Array, blur_px: float = 0.55) -> Float32Array:
     """An image as blurred as a lens blurs it."""
     return np.asarray(cv2.GaussianBlur(rgb, (3, 3), blur_px))
-
-
-def in_bytes(rgb: Float32Array) -> NDArray[np.uint8]:
-    """An image about [0, 1] in 8 bits."""
-    return np.asarray(np.clip(rgb * np.float32(255.0) + np.float32(0.5), 0.0, 255.0)).astype(np.uint8)

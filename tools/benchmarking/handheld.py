@@ -19,8 +19,7 @@ from slam.results.folder import RunFolder
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.poses import known_poses, poses_beside
 from slam.sequences.recording import RecordedSequence
-from slam.simulation.motion import Motion
-from slam.simulation.options import RoomHazard
+from slam.simulation.options import Motion, RoomHazard
 
 RoomCondition = Literal["clean"] | RoomHazard
 _CONDITIONS: tuple[RoomCondition, ...] = ("clean", "people", "exposure", "blur", "rolling-shutter")

@@ -28,8 +28,7 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import LoopsFile, Metrics
 from slam.runtime.files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
 from slam.sequences.catalogue import sequence_kinds
-from slam.simulation.hazards import Hazard
-from slam.simulation.options import VERSION
+from slam.simulation.options import VERSION, Hazard
 
 Condition = Literal["clean", "hazards"]
 ROOT = Path(__file__).resolve().parents[2]

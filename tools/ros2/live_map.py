@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from slam.commands.export import OBSTACLE_FROM_M, OBSTACLE_TO_M, Grid, ground_along
 from slam.geometry.se3 import FloatArray, apply
-from slam.mapping.views import has_moved
+from slam.mapping.submap import has_moved
 
 USUAL_CAMERA_HEIGHT_M = 1.65
 UNKNOWN = -1  # of a cell

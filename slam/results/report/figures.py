@@ -16,7 +16,7 @@ from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.spatial.transform import Rotation
 
-from slam.evaluation.drift import FIGURE_LENGTHS_M, aligned, paired, segment_errors
+from slam.evaluation.trajectory import FIGURE_LENGTHS_M, aligned, paired, segment_errors
 from slam.formats.ply import R_UP_WORLD
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry.se3 import FloatArray, apply, invert, path_distance, rotation_angle

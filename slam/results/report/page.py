@@ -24,7 +24,7 @@ from erfsfm.common.readers.images import resize_image
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image, Intrinsics
 from slam.loops.verification import Loop
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.results import tables
 from slam.results.folder import RunFolder
 from slam.results.metrics import METRES, AcceptedLoop, LoopsFile, Metrics

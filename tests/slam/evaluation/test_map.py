@@ -9,8 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.evaluation.map import PlacedMetrics, compare, double_wall_share, placed_errors, pose_similarity
-from slam.evaluation.surface import Indices, Mask, Surface, accumulated, backprojected, stretches
+from slam.evaluation.map import (
+    Indices,
+    Mask,
+    PlacedMetrics,
+    Surface,
+    accumulated,
+    backprojected,
+    compare,
+    double_wall_share,
+    placed_errors,
+    pose_similarity,
+    stretches,
+)
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray

@@ -6,7 +6,7 @@ import pytest
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
 from slam.geometry import se3
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)

@@ -5,11 +5,11 @@ import pytest
 
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
-from slam.mapping import filters, surface
-from slam.mapping.filters import DepthFilters, KeyframeDepth
+from slam.mapping import surface
+from slam.mapping.depth import DepthFilters, KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.mapping.tile_surface import TileSurface, with_holes_closed
-from slam.mapping.views import evened
+from slam.mapping.submap import evened
+from slam.mapping.surface import TileSurface, with_holes_closed
 
 
 def test_exposure_is_evened_out(street_map):
@@ -77,7 +77,7 @@ def test_only_holes_that_look_upwards_are_closed(up: tuple[float, float, float],
 def test_how_far_depth_is_fused_depends_on_its_sigma(monkeypatch):
     camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
     depth = np.repeat(np.linspace(15, 40, 100, dtype=np.float32)[None], 50, axis=0)
-    monkeypatch.setattr(filters, "_MAX_DEPTH_STEP", 10.0)
+    monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_STEP", 10.0)
     config = MappingConfig(depth_max_m=20)
     image = np.full((50, 100, 3), 90, np.uint8)
 

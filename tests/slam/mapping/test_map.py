@@ -7,8 +7,8 @@ from slam.frames import Frame, Intrinsics
 from slam.frontend import drive
 from slam.frontend.drive import Keyframe
 from slam.geometry import se3
-from slam.mapping import filters, submap, surface
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping import submap, surface
+from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
@@ -117,8 +117,8 @@ def test_flying_pixels_and_far_depth_are_left_out(monkeypatch):
     smeared[:8] = 60.0  # sky
 
     def fuse(max_depth_step):
-        monkeypatch.setattr(filters, "_MAX_DEPTH_STEP", max_depth_step)
-        monkeypatch.setattr(filters, "_MAX_DEPTH_DIFFERENCE", 10.0)
+        monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_STEP", max_depth_step)
+        monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_DIFFERENCE", 10.0)
         monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
         monkeypatch.setattr(submap, "TRUNCATION_VOXELS", 4.5)
         tsdf_map = TsdfMap(MappingConfig(), CAMERA)
@@ -181,7 +181,7 @@ def test_a_car_that_comes_towards_the_camera_is_not_fused(monkeypatch):
         x, y, z = tsdf_map.mesh().points.T
         return int(((np.abs(x + 4.0) < 0.9) & (y < 1.2) & (z < 24.0)).sum())
 
-    monkeypatch.setattr(filters, "_MAX_DEPTH_DIFFERENCE", 0.3)
+    monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_DIFFERENCE", 0.3)
     monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
     street_alone, with_car = street_map(frames=12), street_map(oncoming, frames=12)
     assert with_car.statistics()["filters"]["moving"] > 0.001 > street_alone.statistics()["filters"]["moving"]

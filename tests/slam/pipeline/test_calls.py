@@ -14,7 +14,7 @@ from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
 from slam.loops.descriptors import FeatureExtractor
-from slam.mapping.depth_refinement import DepthRefiner
+from slam.mapping.depth import DepthRefiner
 from slam.mapping.submap import Fusion
 from slam.pipeline.run import SlamPipeline
 from slam.sequences.catalogue import SimulatedSequence

@@ -23,7 +23,7 @@ from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, Sequence
 from slam.frontend.scale.metric_scale import LengthUnit, Scale, ScaleEstimate
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray, apply
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.results.estimate_metrics import (
     DepthQuality,
     coverage,

@@ -9,9 +9,8 @@ from slam.geometry import se3
 from slam.results.estimate_metrics import find_truth
 from slam.sequences.catalogue import SimulatedSequence, open_sequence
 from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.motion import FASTEST_TURN_DEG, Motion
-from slam.simulation.options import SimulationOptions
-from slam.simulation.rooms import SimulatedRooms
+from slam.simulation.options import Motion, SimulationOptions
+from slam.simulation.rooms import FASTEST_TURN_DEG, SimulatedRooms
 
 SMALL = {"width": 96, "height": 72}
 

@@ -11,10 +11,9 @@ from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import FLAT, Material, Soup
 from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.options import SimulationOptions
+from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.street import SimulatedStreet
-from slam.simulation.surface import Surface, place_rays
-from slam.simulation.variety import draw_variety
+from slam.simulation.world import Surface, place_rays
 
 SMALL = {"width": 208, "height": 64}
 
@@ -199,7 +198,7 @@ def test_depth_of_a_slope_is_that_of_hand(slope: float) -> None:
     ground = soup.instance(Material.ASPHALT, np.full(3, 0.3))
     soup.quad(np.array([0.0, -500.0, 0.0]), np.array([900.0, 0.0, 900.0 * slope]), np.array([0.0, 1000.0, 0.0]), ground)
     rays = place_rays(T_SCENE_CAMERA, CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3).astype(np.float32))
-    depth = Surface.of(soup.finish(FLAT)).cast(rays)["t_hit"].reshape(32, 64)
+    depth = Surface(soup.finish(FLAT)).cast(rays)["t_hit"].reshape(32, 64)
     row = np.arange(22, 32)
     expected = 1.5 / ((row - 15.5) / 50.0 + slope)  # 1.5 - depth (v - cy) / fy = slope depth
     np.testing.assert_allclose(depth[22:], np.where(expected > 0.0, expected, np.inf)[:, None].repeat(64, 1), rtol=1e-5)

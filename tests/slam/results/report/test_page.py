@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from slam.formats.trajectory import Trajectory
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.verification import Loop
-from slam.mapping.filters import KeyframeDepth
+from slam.mapping.depth import KeyframeDepth
 from slam.results.folder import RunFolder
 from slam.results.report.figures import MapView
 from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report

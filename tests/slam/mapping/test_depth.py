@@ -5,7 +5,7 @@ import pytest
 
 from erfsfm.mvs.fusion import DepthFusion
 from slam.frames import Intrinsics
-from slam.mapping.depth_refinement import DepthRefiner
+from slam.mapping.depth import DepthRefiner
 
 CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
 DEPTH = np.full((32, 64), 10.0, np.float32)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.mapping import tile_surface
-from slam.mapping.tile_surface import extract_tile
+from slam.mapping import surface
+from slam.mapping.surface import extract_tile
 
 
 def test_the_order_of_vertices_in_one_place_is_that_of_their_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,7 +21,7 @@ def test_the_order_of_vertices_in_one_place_is_that_of_their_triangles(monkeypat
     found = []
     for order in permutations(range(6)):
         place = np.argsort(order)
-        monkeypatch.setattr(tile_surface, "_extract", lambda *_, o=order, p=place: (vertices[list(o)], p[triangles]))
+        monkeypatch.setattr(surface, "_extract", lambda *_, o=order, p=place: (vertices[list(o)], p[triangles]))
         mesh = extract_tile(submaps, np.zeros(3, dtype=np.int64), 0.1, 1.0)
         assert mesh is not None
         found.append((mesh.vertices, mesh.triangles))

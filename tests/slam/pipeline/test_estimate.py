@@ -10,8 +10,8 @@ import pytest
 from erfsfm.mvs.fusion import DepthFusion
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
-from slam.mapping.filters import KeyframeDepth
-from slam.pipeline.fusion import keyframe_depths
+from slam.mapping.depth import KeyframeDepth
+from slam.pipeline.estimate import keyframe_depths
 from slam.runtime.errors import Failed
 from slam.runtime.resources import SpillFile
 

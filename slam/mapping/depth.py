@@ -1,15 +1,22 @@
-"""Which pixels of a depth map are fused. Each filter has a name, settings, and the share of pixels that it took."""
+"""The depth of keyframes that is fused: refined by their neighbours at the optimised poses (`erfsfm.mvs`) and filtered.
+
+Each filter has a name, settings, and the share of pixels that it took.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
+from erfsfm.mvs.refine import Decide, RefinedDepth, measure
+from erfsfm.mvs.views import Appearance, neighbours_around
 from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics, Mask
 from slam.geometry.se3 import FloatArray, invert
@@ -29,6 +36,7 @@ _EXACT = 0.01  # relative sigma below which depth is not a network's: border, sk
 _BEHIND = 1.2  # depth that an earlier view sees over that of a thing which was not there yet
 _PIECE = np.ones((5, 5), np.uint8)  # pixels of the least such thing: at edges, depth is blurred
 FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agreement", "moving")
+_REMEMBERED = 24
 
 
 @dataclass(frozen=True)
@@ -167,3 +175,52 @@ def _at_edges(depth: DepthMap, max_step: float) -> Mask:
         edges[near] |= step
         edges[far] |= step
     return edges
+
+
+class DepthRefiner:
+    """Refines keyframes of one drive in time order."""
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        indices: Sequence[int],
+        T_world_camera: FloatArray,
+        image: Callable[[int], Image],
+        decide: Decide,
+    ) -> None:
+        """Keyframes of these frame numbers, ascending, at poses ``(K, 4, 4)`` in the unit of the depths to come.
+
+        ``image`` gives that of the n-th keyframe, of these intrinsics; ``decide`` chooses learned or measured depth.
+        """
+        self._intrinsics = intrinsics
+        self._indices = np.asarray(indices)
+        self._T_world_camera = T_world_camera
+        self._decide = decide
+
+        @lru_cache(maxsize=_REMEMBERED)
+        def appearance(n: int) -> Appearance:
+            return Appearance.of(np.asarray(cv2.cvtColor(image(n), cv2.COLOR_RGB2GRAY), np.uint8))
+
+        self._appearance = appearance
+
+    def refine(self, n: int, depth: DepthMap) -> RefinedDepth | None:
+        """The n-th keyframe's metric depth ``(H, W)``, refined; None where no neighbour is at a useful distance.
+
+        Pixels without depth, as other sources than the networks may have, begin with that of the nearest pixel which
+        has one; what the images do not measure there has an infinite sigma.
+        """
+        unknown = ~(np.isfinite(depth) & (depth > 0))
+        if unknown.all():
+            return None
+        chosen = neighbours_around(self._T_world_camera, n, float(np.median(depth[~unknown])), self._indices)
+        if not chosen:
+            return None
+        if unknown.any():
+            nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+            depth = depth[tuple(nearest)]
+        T_neighbour_target = invert(self._T_world_camera[chosen]) @ self._T_world_camera[n]
+        others = [self._appearance(k) for k in chosen]
+        measurement = measure(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target)
+        refined = self._decide(measurement)
+        refined.relative_sigma[unknown & ~refined.measured] = np.inf
+        return refined

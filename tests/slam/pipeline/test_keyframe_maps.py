@@ -1,26 +1,171 @@
 import functools
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import room
+from oracle import OraclePredictor
 
-from slam.config.sections import KeyframesConfig, SlamConfig
-from slam.frames import LOOP_SOURCE, RelativePose, View
+from erfsfm.common.processes import opencv_threads
+from slam import Slam
+from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
+from slam.frames import LOOP_SOURCE, DepthMap, Frame, RelativePose, View
 from slam.frontend.drive import Drive
+from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
-from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.visual.motion import Motion
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.loops.closure import LoopClosures, find_loops
 from slam.loops.consistency import Track
 from slam.loops.verification import Loop
-from slam.pipeline import map_closure
-from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.map_closure import MapClosure, close_maps
+from slam.pipeline import keyframe_maps
+from slam.pipeline.keyframe_maps import FrontEnd, KeyframeTracking, MapClosure, choose, close_maps
+from slam.pipeline.observer import Observer
+from slam.runtime.errors import Failed
+from slam.runtime.resources import Stopwatch
 from slam.sequences.catalogue import open_sequence
+
+
+def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
+    """Steps of a camera height each."""
+    rng = np.random.default_rng(0)
+    motions = []
+    for k in range(count):
+        T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
+        pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
+        motions.append(Motion(pose, np.eye(6), seconds=seconds))
+    return Drive(motions=motions, roads=[GroundPlane(1.0, np.array([0.0, 1.0, 0.0]), 1.0)] * count)
+
+
+@pytest.mark.parametrize(
+    ("count", "scatter", "seconds", "front_end"),
+    [
+        *((60, 0.02, 0.1, "steps"), (60, 1.0, 0.1, "keyframes"), (60, 0.02, 1.0, "keyframes")),
+        *((12, 0.02, 0.1, "steps"), (12, 1.0, 0.1, "keyframes"), (12, 0.02, 1.0, "both"), (8, 0.02, 0.1, "both")),
+    ],
+)
+def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
+    count: int, scatter: float, seconds: float, front_end: FrontEnd
+) -> None:
+    drive = steps(count, scatter, seconds)
+    assert choose(KeyframesConfig(), None, drive) == front_end
+    drive.roads[:] = [Failed("no road")] * count
+    assert choose(KeyframesConfig(), None, drive) != "steps"
+
+
+def test_a_known_camera_height_and_a_setting_choose() -> None:
+    by_hand = steps(60, 1.0)
+    assert choose(KeyframesConfig(), 1.65, by_hand) == "steps"
+    assert choose(KeyframesConfig(use="never"), None, by_hand) == "steps"
+    assert choose(KeyframesConfig(use="always"), 1.65, by_hand) == "keyframes"
+
+
+KEYFRAMES_ALONE = SlamConfig(
+    keyframes=KeyframesConfig(use="always"),
+    loops=LoopsConfig(enabled=False),
+    mapping=MappingConfig(enabled=False),
+)
+
+
+def completed(observer: Observer) -> Drive:
+    drive = observer.measured()
+    return complete_drive(drive, 4, keyframe_poses(drive.maps, room.INTRINSICS))
+
+
+@pytest.mark.parametrize("stands", [False, True])
+def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
+    """Before their map begins and over a gap, not beside repeated images: the map tells whether the camera stood."""
+    truth, blank, repeated = room.walk(40), (24, 25), (32, 33)
+    if stands:
+        truth[34:] = truth[32:38]
+    truth[[*repeated]] = truth[31]
+    oracle = OraclePredictor(truth, lambda k: 0.5 * room.depth_map(truth[k]))  # in the unit of its poses
+    with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
+        for k, T in enumerate(truth):
+            frame = room.frame(k, T)
+            observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
+        drive = completed(observer)
+    started = min(drive.map_poses.segments)
+    assert started < 10 and len(drive.map_poses.segments) == 40 - len(blank) - started
+    late = [motion.ends for motion in observer.drive.motions if motion.ends[0] > 19]
+    assert late == [(23, 26)]
+    assert set(drive.interpolated) == {*blank, *(() if stands else repeated)}
+
+
+@pytest.mark.parametrize("interrupted", [(), (19, 21), (20, 22)])
+def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) -> None:
+    """The same ones where the observations are asked for in between."""
+    truth = room.walk(40)
+    predicted: list[int] = []
+
+    def depth(k: int) -> DepthMap:
+        predicted.append(k)
+        return room.depth_map(truth[k])
+
+    oracle = OraclePredictor(truth, depth)
+    with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
+        for k, T in enumerate(truth):
+            observer.add(k, room.frame(k, T))
+            if k in interrupted:
+                observer.measured()
+        drive = completed(observer)
+    keyframes = drive.maps[-1].map.keyframes
+    assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
+    assert [k for k in predicted if k >= 20] == [keyframe.index for keyframe in keyframes if keyframe.index >= 20]
+    assert [snippet.target for snippet in drive.trusted if snippet.target > 18] == [22, 26, 30, 34]
+    assert len(drive.trusted[0].sources) == 4 and not drive.interpolated
+
+
+@pytest.mark.parametrize("camera_height_m", [None, 1.65])
+def test_opencv_takes_all_cores_for_keyframes_alone(
+    camera_height_m: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A known height is that of a vehicle, whose networks need a core of their own."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    truth = room.walk(2)
+    oracle, config = OraclePredictor(truth, lambda k: room.depth_map(truth[k])), SlamConfig()
+    with opencv_threads(1):
+        with Observer(oracle, room.INTRINSICS, config, Stopwatch(), camera_height_m=camera_height_m):
+            assert cv2.getNumThreads() == (3 if camera_height_m is None else 1)
+        assert cv2.getNumThreads() == 1
+
+
+def test_observations_stay_while_frames_follow() -> None:
+    truth = room.walk(40)
+    oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
+    with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
+        for k in range(26):
+            observer.add(k, room.frame(k, truth[k]))
+        drive = observer.measured()
+        before = pickle.dumps(drive)
+        for k in range(26, 40):
+            observer.add(k, room.frame(k, truth[k]))
+        assert len(observer.measured()) == 40
+    assert drive.maps and drive.events and pickle.dumps(drive) == before
+
+
+def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:
+    """Although the networks see another motion."""
+    truth, blank = room.walk(40), range(27, 40)
+    straight = chain(from_rotation_vector(np.zeros((39, 3)), np.tile([0.0, 0.0, 0.1], (39, 1))))
+    oracle = OraclePredictor(straight, lambda k: room.depth_map(truth[k]))
+    with Slam(oracle, room.INTRINSICS, KEYFRAMES_ALONE) as slam:
+        for k, T in enumerate(truth):
+            image = room.frame(k, T).image
+            slam.add_frame(np.zeros_like(image) if k in blank else image, 0.1 * k)
+            if k == blank[0] - 1:
+                before = slam.trajectory().T_world_camera
+        after = slam.trajectory().T_world_camera
+    np.testing.assert_array_equal(after[: len(before)], before)
+    assert np.linalg.norm(after[-1, :3, 3] - before[-1, :3, 3]) > 0.0
+
 
 CONFIG = SlamConfig()
 
@@ -94,7 +239,7 @@ def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(monkey
         loop = Loop(within, 1 + max(loop.inliers for loop in closures.accepted), 1.0)
         return replace(closures, accepted=(*closures.accepted, loop))
 
-    monkeypatch.setattr(map_closure, "find_loops", find)
+    monkeypatch.setattr(keyframe_maps, "find_loops", find)
     back, closer = there_and_back(90, roll=0.02), there_and_back(110, roll=0.5, closer=0.3)
     truth = np.concatenate([back, back[:6], closer[95:]])
     after = closed(room.tracked(truth, [0] * 90 + [9] * 6 + [0] * 15))

@@ -22,9 +22,8 @@ from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.geometry.resection import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places, PlaceStructure
-from slam.loops.retrieval import PlaceIndex
+from slam.loops.retrieval import FeatureExtractor, PlaceIndex, hamming
 from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError

@@ -25,11 +25,9 @@ from slam.frames import (
 )
 from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
-from slam.frontend.scale.road_homography import RoadStep
-from slam.frontend.scale.road_plane import GroundPlane
-from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.focal_length import FocalLength
+from slam.frontend.road import GroundPlane, RoadStep
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
+from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
 from slam.runtime.storage.spill import SpilledArray, SpillFile
@@ -103,7 +101,7 @@ class Drive:
         ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as the steps have them.
         ``maps`` are those of keyframes and ``events`` what became of them; a drive measured by steps alone has none.
 
-    Added by `slam.frontend.gap_interpolation.complete_drive`, which also leaves out views and keyframes of interpolated
+    Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of interpolated
     frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
         ``trusted`` are the snippets that the network measured on usable frames, ``interpolated`` the frames of gaps
         with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by the maps.

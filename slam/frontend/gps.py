@@ -16,7 +16,7 @@ from slam.config.sections import GpsConfig, ScaleMode
 from slam.formats.trajectory import nearest_stamps
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
-from slam.frontend.scale.metric_scale import MIN_FRAMES, ScaleEstimate
+from slam.frontend.scale import MIN_FRAMES, ScaleEstimate
 from slam.geometry import se3
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.robust import mad_sigma

@@ -1,13 +1,18 @@
-"""The pose graph: relative poses in, the most likely trajectory out.
+"""The pose graph: relative poses in, the most likely trajectory out; and that of maps without a common unit.
 
 GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
 that order. A Huber kernel limits outliers: redescending ones do not recover from a drifted start.
+
+Poses and units of the cameras of several maps are those that agree best with measured similarities, as in Strasdat et
+al. 2010: scale drifts along a monocular map, and loops measure how far. GTSAM writes a similarity as
+``p -> s (R p + t)``.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.formats.g2o import write_g2o
 from slam.frames import LOOP_SOURCE, RelativePose
-from slam.geometry.se3 import FloatArray, invert, is_se3
+from slam.geometry.se3 import FloatArray, invert, is_se3, make
 from slam.runtime.errors import SlamError
 
 _ANCHOR_SIGMA = 1e-6
@@ -232,3 +237,59 @@ def _check(edge: RelativePose) -> None:
 
 def _pose3(T_a_b: FloatArray) -> Any:
     return gtsam.Pose3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3])
+
+
+@dataclass(frozen=True)
+class RelativeSimilarity:
+    """A measured similarity between two cameras whose units of length differ: ``p_from = scale R p_to + t``.
+
+    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of rotation and
+    translation; the last sigma is that of the logarithm of the scale.
+    """
+
+    from_index: int
+    to_index: int
+    T_from_to: FloatArray
+    scale: float
+    sigmas: FloatArray
+
+
+def optimise_similarities(
+    T_world_camera: FloatArray, scales: FloatArray, edges: Sequence[RelativeSimilarity]
+) -> tuple[FloatArray, FloatArray]:
+    """Poses and units of cameras, the first one fixed.
+
+    Args:
+        T_world_camera: start ``(K, 4, 4)``.
+        scales: start ``(K,)``: units of the world per unit of each camera.
+        edges: connect all cameras.
+
+    Returns:
+        ``T_world_camera`` ``(K, 4, 4)`` and scales ``(K,)``.
+
+    Raises:
+        SlamError: the system cannot be solved.
+    """
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, (T, scale) in enumerate(zip(T_world_camera, scales, strict=True)):
+        values.insert(k, _similarity(T, float(scale)))
+    fixed = gtsam.noiseModel.Isotropic.Sigma(7, _ANCHOR_SIGMA)
+    graph.add(gtsam.PriorFactorSimilarity3(0, values.atSimilarity3(0), fixed))
+    for edge in edges:
+        units = np.concatenate([np.ones(3), np.full(3, edge.scale), np.ones(1)])
+        measured, noise = _similarity(edge.T_from_to, edge.scale), robust_noise(edge.sigmas / units)
+        graph.add(gtsam.BetweenFactorSimilarity3(edge.from_index, edge.to_index, measured, noise))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(_MAX_ITERATIONS)
+    try:
+        solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    except RuntimeError as error:
+        raise SlamError(f"the maps cannot be joined: {str(error).strip().partition(chr(10))[0]}") from error
+    found = [solved.atSimilarity3(k) for k in range(len(T_world_camera))]
+    R = Rotation.from_matrix([each.rotation().matrix() for each in found]).as_matrix()
+    scales = np.array([each.scale() for each in found])
+    return make(R, scales[:, None] * np.array([each.translation() for each in found])), scales
+
+
+def _similarity(T_a_b: FloatArray, scale: float) -> Any:
+    return gtsam.Similarity3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3] / scale, scale)

@@ -1,64 +1,129 @@
-"""Place recognition: a bag of binary words trained on the run itself, compared by tf-idf.
+"""Places known again by binary descriptors of corners, in a bag of words trained on the run and compared by tf-idf.
 
-As in DBoW2 (Galvez-Lopez and Tardos 2012), with one flat vocabulary instead of a downloaded tree: a run has
-few enough frames for it, and words trained on its own images discriminate better.
+Frames of a drive have ORB (Rublee et al. 2011) at corners of its own. Corners that are tracked have SIFT (Lowe 2004) as
+256 bits, so that words, matching and files are the same: two thresholds code a value, and Hamming's distance is the
+distance between the sums of coded differences.
+
+Words are those of DBoW2 (Galvez-Lopez and Tardos 2012), with one flat vocabulary instead of a downloaded tree: a run
+has few enough frames for it, and words trained on its own images discriminate better.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from erfsfm.common.processes import side_by_side
-from slam.frames import Descriptors, View
+from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View, nearest_depth, trusted_depth
 from slam.geometry.se3 import FloatArray
-from slam.loops.descriptors import hamming
-from slam.loops.verification import LoopThresholds
 
+_CELL_PX = 32
+_DETECTED_PER_KEPT = 4
+_EDGE_PX = 16
+_CORNER_CONTRAST = 10  # least contrast of a corner, grey levels
+_MAX_FEATURES = 500  # largest number of corners kept of a frame
+_SIFT_SIZE_PX = 8.0
+# terciles of square roots of SIFT's normed values (Arandjelovic and Zisserman 2012) over the corners of a kitchen
+_LOW, _HIGH = 0.034, 0.082
+_RADIUS_PX = 15
+_BLUR_PX = 2.0
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
-_BLOCK = 256
 _BLOCK_DESCRIPTORS = 200  # fit the processor's cache
 _WORDS = 1000  # size of the binary vocabulary learned on the run
-Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 
 
-class Candidate(NamedTuple):
-    """Two similar views by their rows; ``score`` is their similarity over that of neighbouring frames.
+class FeatureExtractor:
+    """Extracts features of the frames of one sequence, spread over the image by a grid."""
 
-    ``rank`` counts from the best candidate of the later view, which is 0.
-    """
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        self._intrinsics = intrinsics
+        self._orb = cv2.ORB.create(
+            nfeatures=_DETECTED_PER_KEPT * _MAX_FEATURES,
+            nlevels=6,
+            edgeThreshold=_EDGE_PX,
+            fastThreshold=_CORNER_CONTRAST,
+        )
 
-    earlier: int
-    later: int
-    score: float
-    rank: int
+    def view(self, frame: Frame, depth_unscaled: DepthMap, height_unscaled: float | None = None) -> View:
+        """Features of a frame, at the size of its image.
+
+        Args:
+            frame: the frame, at the size of the intrinsics.
+            depth_unscaled: its learned z-depth ``(H, W)``.
+            height_unscaled: camera height in the same unit (see `trusted_depth`).
+        """
+        pixels, descriptors = self.corners(frame.grey)
+        z = trusted_depth(nearest_depth(depth_unscaled, pixels), height_unscaled)
+        points = self._intrinsics.rays(pixels) * z[:, None]
+        return View(frame.index, pixels, descriptors, points.astype(np.float32))
+
+    def corners(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
+        """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
+        detected = self._orb.detect(grey, None)
+        strongest = _strongest_per_cell(detected, grey.shape, _MAX_FEATURES)
+        chosen, descriptors = self._orb.compute(grey, [detected[k] for k in strongest])
+        if not chosen:
+            return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
+        return np.array([keypoint.pt for keypoint in chosen], np.float32), descriptors
 
 
-def find_candidates(views: Sequence[View], apart: Apart, thresholds: LoopThresholds) -> list[Candidate]:
-    """For each view, in time order, the most similar earlier views, the best first.
+def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
+    """Descriptors ``(M, 32)`` of corners ``(M, 2)``, each turned into its own direction."""
+    if not len(pixels):
+        return np.zeros((0, 32), np.uint8)
+    # at half the size a quarter of the pixels describe the same surroundings
+    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    corners = [
+        cv2.KeyPoint(0.5 * float(u) - 0.25, 0.5 * float(v) - 0.25, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0)
+        for (u, v), angle in zip(pixels, _directions_deg(grey, pixels), strict=True)
+    ]
+    _, values = cv2.SIFT.create().compute(half, corners)
+    roots = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-9))
+    return np.packbits(np.concatenate([roots > _LOW, roots > _HIGH], axis=1), axis=1)
 
-    ``apart`` says of some views ``(B,)``, by their rows, and of all views whether they may make a loop ``(B, V)``.
-    """
-    if len(views) < 2 or not any(map(len, views)):
-        return []
-    weighted = PlaceIndex(views).weights
-    indices, rows = np.array([view.index for view in views]), np.arange(len(views))
-    neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
-    expected = np.maximum(np.concatenate([neighbour[:1], neighbour]), 1e-3)
-    candidates = []
-    for start in range(0, len(views), _BLOCK):
-        block = rows[start : start + _BLOCK]
-        scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
-        scores[~apart(block) | (rows >= block[:, None])] = 0.0
-        for later, row in zip(block, scores, strict=True):
-            peaks = enumerate(_peaks(row, indices, thresholds))
-            candidates += [Candidate(k, int(later), float(row[k]), rank) for rank, k in peaks]
-    return candidates
+
+def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
+    """Differing bits ``(M, N)`` of every pair of descriptors ``(M, 32)`` and ``(N, 32)``."""
+    words_first, words_second = (np.ascontiguousarray(d).view(np.uint64).T for d in (first, second))  # (4, M), (4, N)
+    differing = np.zeros((len(first), len(second)), np.uint16)
+    for a, b in zip(words_first, words_second, strict=True):
+        differing += np.bitwise_count(a[:, None] ^ b)
+    return differing.astype(np.float32)
+
+
+def _strongest_per_cell(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
+    """Rows of at most ``count`` keypoints: the best of every cell first, then the second best, and so on."""
+    if len(keypoints) == 0:
+        return np.zeros(0, np.intp)
+    pixels = np.array([k.pt for k in keypoints])
+    response = np.array([k.response for k in keypoints])
+    cell = (pixels[:, 1] // _CELL_PX).astype(int) * (shape[1] // _CELL_PX + 1) + (pixels[:, 0] // _CELL_PX).astype(int)
+    by_cell = np.lexsort((-response, cell))
+    first_of_cell = np.searchsorted(cell[by_cell], cell[by_cell])
+    rank = np.arange(len(by_cell)) - first_of_cell
+    order = by_cell[np.lexsort((-response[by_cell], rank))]
+    return np.asarray(order[:count])
+
+
+def _directions_deg(grey: Grey, pixels: NDArray[np.floating[Any]]) -> FloatArray:
+    """From each corner to the centroid of the grey levels around it (Rosin 1999), degrees in [0, 360)."""
+    y, x = np.mgrid[-_RADIUS_PX : _RADIUS_PX + 1, -_RADIUS_PX : _RADIUS_PX + 1]
+    inside = x**2 + y**2 <= _RADIUS_PX**2
+    x, y = x[inside], y[inside]
+    border = _RADIUS_PX + 1
+    blurred = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
+    padded = cv2.copyMakeBorder(blurred, border, border, border, border, cv2.BORDER_REFLECT)
+    u, v = np.rint(pixels).astype(np.int64).T + border
+    places = np.add.outer(v * padded.shape[1] + u, y * padded.shape[1] + x)
+    around = padded.ravel()[places].astype(np.float32)  # whole numbers, of which sums are exact
+    down, right = (around @ np.column_stack([y, x]).astype(np.float32)).astype(np.float64).T
+    return np.asarray(np.rad2deg(np.arctan2(down, right)) % 360.0)
 
 
 class PlaceIndex:
@@ -121,16 +186,3 @@ def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:
     norm = np.sqrt(np.asarray((weights * weights).sum(axis=1)).ravel())
     weights.data = weights.data / np.repeat(np.maximum(norm, 1e-12), np.diff(weights.indptr))
     return weights
-
-
-def _peaks(scores: FloatArray, indices: NDArray[np.intp], thresholds: LoopThresholds) -> list[int]:
-    """The best columns, none near a better one."""
-    scores = scores.copy()
-    peaks: list[int] = []
-    while len(peaks) < thresholds.candidates:
-        best = int(np.argmax(scores))
-        if scores[best] < thresholds.least_score or scores[best] <= 0:
-            break
-        peaks.append(best)
-        scores[np.abs(indices - indices[best]) <= thresholds.candidate_spacing] = 0.0
-    return peaks

@@ -13,7 +13,7 @@ from erfsfm.mvs.refine import Decide
 from slam.config.sections import MappingConfig, SlamConfig
 from slam.frames import Intrinsics
 from slam.frontend.drive import Drive
-from slam.frontend.visual.depth_error import DepthError
+from slam.frontend.visual.self_calibration import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.filters import KeyframeDepth

@@ -15,9 +15,9 @@ from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent
 from slam.frontend.drive import LAST_STEPS, Drive
 from slam.frontend.keyframes.local_map import LocalMap, MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry
-from slam.frontend.keyframes.parts import parts_of
-from slam.frontend.keyframes.unit import learned_unit
-from slam.frontend.scale.road_plane import height_of
+from slam.frontend.keyframes.relative_poses import learned_unit
+from slam.frontend.keyframes.submaps import parts_of
+from slam.frontend.road import height_of
 from slam.geometry.se3 import FloatArray, invert
 
 # looked back for the frame before, and keyframes that give the unit

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from slam.config.sections import SlamConfig
+from slam.frontend.completion import complete_drive
 from slam.frontend.drive import LAST_STEPS, frame_support
 from slam.frontend.factors import chain_odometry, make_factors
-from slam.frontend.gap_interpolation import complete_drive
-from slam.frontend.scale.metric_scale import Scale, find_scale, resolve_mode
+from slam.frontend.scale import Scale, find_scale, resolve_mode
 from slam.geometry.se3 import FloatArray, compose, invert
 from slam.pipeline.observer import Observer
 

@@ -13,14 +13,13 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
-from slam.frontend.keyframes.joining import join
 from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.scale.metric_scale import Scale
+from slam.frontend.keyframes.submaps import join
+from slam.frontend.scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
-from slam.graph.similarity_graph import RelativeSimilarity, optimise_similarities
-from slam.loops.closure import LoopClosures, find_loops, most_inliers_first
-from slam.loops.consistency import Track
+from slam.graph.pose_graph import RelativeSimilarity, optimise_similarities
+from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
 
 logger = logging.getLogger(__name__)

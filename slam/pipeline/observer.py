@@ -17,13 +17,12 @@ from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, resized_mask
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.scale.road_homography import RoadHomography, RoadStep
-from slam.frontend.scale.road_plane import GroundPlaneFitter, height_of
+from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep, height_of
 from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
-from slam.loops.descriptors import FeatureExtractor
+from slam.loops.retrieval import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.storage.spill import SpillFile

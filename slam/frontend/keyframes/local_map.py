@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, View, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
-from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, track
+from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, track
 from slam.geometry.resection import PIXEL_SIGMA
 from slam.geometry.robust import weighted_median
 from slam.geometry.se3 import FloatArray, apply, invert
@@ -26,7 +26,7 @@ TrackIds = NDArray[np.int64]
 
 _IMAGES_KEPT = 20
 _LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
-_MATCHED = OF_KEYFRAMES._replace(levels=1)  # guesses are near
+_MATCHED = KEYFRAME_SEARCH._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
 _SHARED = 5

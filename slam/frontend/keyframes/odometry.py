@@ -2,7 +2,13 @@
 
 As in PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015), with optical flow in place of descriptors. At
 30 frames a second the parallax of neighbouring frames is a pixel; geometry over longer baselines needs tracks that do
-not drift, so each corner is compared with its image in the keyframe, not with that in the frame before.
+not drift, so each corner is compared with its image in the keyframe, not with that in the frame before. A lost camera
+is found again among the keyframes of its map, by corners that match those with points.
+
+A scene without relief fits a motion and its reverse alike, with near and far exchanged. From learned depth alone the
+adjustment may end in the wrong one, and from there no later keyframe leads back. So the first motion with parallax,
+where points have nothing but learned depth, also starts from motions by essential matrix and homographies (Faugeras
+and Lustman 1988), and what fits best is taken.
 """
 
 from __future__ import annotations
@@ -13,9 +19,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent, View
-from slam.frontend.keyframes.first_motion import first_motion
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
 from slam.frontend.keyframes.image_turn import (
     ImageTurn,
     SmallImage,
@@ -26,13 +33,22 @@ from slam.frontend.keyframes.image_turn import (
     small_image,
     turned,
 )
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.relocalisation import Relocaliser
-from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, new_corners, track
-from slam.geometry.epipolar import parallax_px
+from slam.frontend.keyframes.local_map import (
+    DEPTH_SIGMA,
+    LocalMap,
+    MapSegment,
+    NewImage,
+    TrackedFrame,
+    TrackedKeyframe,
+    TrackIds,
+)
+from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
+from slam.frontend.visual.two_view import CORNER_CORRELATION
+from slam.geometry.epipolar import parallax_px, triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
 from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.descriptors import describe
+from slam.loops.retrieval import PlaceIndex, describe
+from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +66,12 @@ _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _MAX_CORNERS = 500  # of a keyframe
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+_PLACES_TRIED = 6
+# a single image has no points of its own that would confirm the pose, so it takes twice those of a loop
+_LEAST_CONFIRMING = 30
+_FIRST_INLIER_PX = 1.0
+_FIRST_LIMITS = 30, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
+_GAIN = 0.5 * (3.0 * CORNER_CORRELATION) ** 2  # of the cost: three sigmas, of corners whose errors are correlated
 
 
 class KeyframeOdometry:
@@ -194,7 +216,7 @@ class KeyframeOdometry:
         if turn is not None and turn.correlation > _LEAST_CORRELATION:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
         corners = keyframe.places[rows].astype(np.float32)
-        tracked, kept = track(keyframe.grey, frame.grey, corners, OF_KEYFRAMES, guesses)
+        tracked, kept = track(keyframe.grey, frame.grey, corners, KEYFRAME_SEARCH, guesses)
         kept &= are_inside(tracked, frame.grey.shape)
         shift = np.median(tracked[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
@@ -306,3 +328,97 @@ class KeyframeOdometry:
 
     def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
         return TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world)
+
+
+class Relocaliser:
+    """Finds single images among the keyframes of one map."""
+
+    def __init__(self, local: LocalMap, intrinsics: Intrinsics, seed: int = 0) -> None:
+        """Index the keyframes of the map, at least one; ``seed`` is that of RANSAC."""
+        self.local, self._intrinsics = local, intrinsics
+        self._views, self._T_map_camera = local.views(local.points), local.T_world_camera
+        self._index = PlaceIndex(self._views)
+        self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
+
+    def locate(self, image: View) -> tuple[FloatArray, TrackIds, Pixels, int] | None:
+        """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few.
+
+        Returns:
+            ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)`` where the image sees
+            them, and the frame of the keyframe with most of them.
+        """
+        keyframes, rows, points = self._matched(image)
+        best: Sighting | None = None
+        for keyframe in np.unique(keyframes):
+            here = keyframes == keyframe
+            seen = self._verifier.resect(points[here].astype(np.float32), image.pixels[rows[here, 1]])
+            if isinstance(seen, Sighting) and (best is None or len(seen.inliers) > len(best.inliers)):
+                best = seen
+        if best is None:
+            return None
+        X = apply(best.T_camera_points, points)
+        ahead = X[:, 2] > 0
+        X[~ahead, 2] = 1.0
+        residual = np.linalg.norm(self._intrinsics.project(X) - image.pixels[rows[:, 1]], axis=1)
+        kept = np.flatnonzero(ahead & (residual < OF_KEYFRAMES.reprojection_px))
+        _, first = np.unique(rows[kept, 1], return_index=True)
+        kept = kept[first]
+        if len(kept) < _LEAST_CONFIRMING:
+            return None
+        seen_by = zip(keyframes[kept].tolist(), rows[kept, 0].tolist(), strict=True)
+        tracks = np.array([self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by])
+        tracks, once = np.unique(tracks, return_index=True)
+        place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
+        return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
+
+    def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+        """Keyframes ``(M,)``, rows of their corners and of the image's ``(M, 2)``, and points in the map ``(M, 3)``."""
+        keyframes, rows, points = [np.zeros(0, np.intp)], [np.zeros((0, 2), np.intp)], [np.zeros((0, 3))]
+        for keyframe in self._index.nearest(image, _PLACES_TRIED):
+            view = self._views[keyframe]
+            pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
+            pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
+            keyframes.append(np.full(len(pairs), keyframe))
+            rows.append(pairs)
+            points.append(apply(self._T_map_camera[keyframe], view.points[pairs[:, 0]].astype(np.float64)))
+        return np.concatenate(keyframes), np.concatenate(rows), np.concatenate(points)
+
+
+def first_motion(
+    T_now_before: FloatArray,
+    pixels_before: FloatArray,
+    pixels: FloatArray,
+    depth: FloatArray,
+    intrinsics: Intrinsics,
+    seed: int = 0,
+) -> tuple[FloatArray, FloatArray]:
+    """``T_now_before`` of two views, and the depth in the first one ``(M,)``, in the unit of a prior.
+
+    From corners at ``pixels_before`` and ``pixels`` ``(M, 2)`` with ``depth`` ``(M,)`` in the first view by the prior.
+    """
+    rays_before, rays = intrinsics.rays(pixels_before), intrinsics.rays(pixels)
+    tolerance = _FIRST_INLIER_PX / intrinsics.fx
+    by_essential = unit_pose_by_essential(rays_before, rays, tolerance, seed)
+    motions = [] if by_essential is None else [by_essential]
+    starts = [(T_now_before, depth)]
+    for motion in motions + unit_poses_by_homography(rays_before, rays, tolerance, seed):
+        triangulated = triangulated_depth(rays_before, rays, motion)
+        ahead = triangulated > 0.0
+        if ahead.any():
+            unit = float(np.median(depth[ahead] / triangulated[ahead]))
+            at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
+            R = Rotation.from_matrix(motion.R_current_previous).as_matrix()  # OpenCV's are less exact
+            starts.append((make(R, unit * motion.direction), at))
+    rows = np.arange(len(pixels))
+    sightings = Sightings(
+        np.repeat([0, 1], len(rows)),
+        np.tile(rows, 2),
+        np.concatenate([pixels_before, pixels]),
+        np.concatenate([depth, np.full(len(rows), np.nan)]),
+        np.full(2 * len(rows), DEPTH_SIGMA),
+    )
+    problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]))
+    solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_FIRST_LIMITS) for T, z in starts]
+    costs = np.array([adjusted.cost for adjusted in solved])
+    best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
+    return best.T_camera_world[1], best.points[:, 2]

@@ -7,7 +7,7 @@ import pytest
 
 from slam.config.sections import GpsConfig
 from slam.frontend.gps import GpsFixes
-from slam.frontend.scale.metric_scale import ScaleEstimate
+from slam.frontend.scale import ScaleEstimate
 from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from slam.frames import View
-from slam.loops.descriptors import hamming
-from slam.loops.retrieval import Apart, find_candidates
+from slam.loops.closure import Apart, find_candidates
+from slam.loops.retrieval import hamming
 from slam.loops.verification import OF_FRAMES
 
 

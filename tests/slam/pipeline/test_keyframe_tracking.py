@@ -10,10 +10,10 @@ from erfsfm.common.processes import opencv_threads
 from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose
+from slam.frontend.completion import complete_drive
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.keyframes.relative_poses import keyframe_poses
-from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.road import GroundPlane
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.keyframe_tracking import FrontEnd, choose

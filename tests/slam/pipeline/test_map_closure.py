@@ -14,8 +14,7 @@ from slam.frontend.drive import Drive
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
-from slam.loops.closure import LoopClosures, find_loops
-from slam.loops.consistency import Track
+from slam.loops.closure import LoopClosures, Track, find_loops
 from slam.loops.verification import Loop
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking

@@ -14,7 +14,7 @@ import pytest
 from erfsfm.common.readers.images import read_depth_map
 from slam.config.sections import ScaleMode
 from slam.frames import Intrinsics, Sequence
-from slam.frontend.scale.metric_scale import LengthUnit, Scale, ScaleEstimate
+from slam.frontend.scale import LengthUnit, Scale, ScaleEstimate
 from slam.geometry.se3 import FloatArray, apply
 from slam.mapping.filters import KeyframeDepth
 from slam.results.metrics import MapMetrics

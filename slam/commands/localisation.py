@@ -20,7 +20,7 @@ from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.geometry.resection import consensus, resect
+from slam.geometry.multiview import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.places import Places, PlaceStructure
 from slam.loops.retrieval import FeatureExtractor, PlaceIndex, hamming

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Frame, Grey, Intrinsics, Mask, nearest, resized_mask
-from slam.geometry.epipolar import UnitRelativePose
+from slam.geometry.multiview import UnitRelativePose
 from slam.geometry.se3 import FloatArray
 
 Pixels = NDArray[np.float32]

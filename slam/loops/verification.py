@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
-from slam.geometry.resection import consensus, resect
+from slam.geometry.multiview import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_angle
 from slam.loops.retrieval import hamming
 

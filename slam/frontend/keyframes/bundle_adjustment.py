@@ -18,7 +18,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from slam.frames import Intrinsics
-from slam.geometry.resection import LEAST_DEPTH, PIXEL_SIGMA, pixel_jacobian
+from slam.geometry.multiview import LEAST_DEPTH, PIXEL_SIGMA, pixel_jacobian
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, compose, from_rotation_vector
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, View, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, track
-from slam.geometry.resection import PIXEL_SIGMA
+from slam.geometry.multiview import PIXEL_SIGMA
 from slam.geometry.robust import weighted_median
 from slam.geometry.se3 import FloatArray, apply, invert
 

@@ -44,8 +44,16 @@ from slam.frontend.keyframes.local_map import (
 )
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
 from slam.frontend.visual.two_view import CORNER_CORRELATION
-from slam.geometry.epipolar import parallax_px, triangulated_depth, unit_pose_by_essential, unit_poses_by_homography
-from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
+from slam.geometry.multiview import (
+    INLIER_PX,
+    MIN_POINTS,
+    Resection,
+    parallax_px,
+    resect,
+    triangulated_depth,
+    unit_pose_by_essential,
+    unit_poses_by_homography,
+)
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
 from slam.loops.retrieval import PlaceIndex, describe
 from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches

@@ -17,7 +17,7 @@ from scipy.linalg import solveh_banded
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
 from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe, TrackIds
 from slam.frontend.visual.two_view import CORNER_CORRELATION
-from slam.geometry.resection import MIN_POINTS, resect
+from slam.geometry.multiview import MIN_POINTS, resect
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert
 

@@ -27,7 +27,7 @@ from slam.frontend.keyframes.local_map import (
     TrackIds,
 )
 from slam.frontend.keyframes.relative_poses import learned_units
-from slam.geometry.resection import MIN_POINTS
+from slam.geometry.multiview import MIN_POINTS
 from slam.geometry.se3 import FloatArray, apply, chain, invert
 
 _PIXEL_SIGMA = 0.5  # of a sighting, pixels

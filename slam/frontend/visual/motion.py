@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends, RelativePose
-from slam.geometry.epipolar import UnitRelativePose
+from slam.geometry.multiview import UnitRelativePose
 from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma
 from slam.geometry.se3 import FloatArray, invert
 

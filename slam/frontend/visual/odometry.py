@@ -32,25 +32,26 @@ from slam.frames import (
 )
 from slam.frontend.tracking import CornerTracker, PredictedFlow, Tracks
 from slam.frontend.visual.motion import Motion, MotionHistory, RelativeRotation, pose_sigmas
-from slam.frontend.visual.moving_regions import DynamicMask
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
     DEPTH_RELATIVE_SIGMA,
     INLIER_PX,
+    DynamicMask,
     Matches,
     TwoViewEstimate,
     estimate,
     refined,
 )
-from slam.geometry.epipolar import (
+from slam.geometry.multiview import (
+    consensus,
     depth_in_current,
     parallax_px,
+    resect,
     rotation_between,
     triangulated_depth,
     triangulated_nearness,
 )
-from slam.geometry.resection import consensus, resect
 from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray, invert, make
 from slam.runtime.errors import Failed

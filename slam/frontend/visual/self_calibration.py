@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap
 from slam.frontend.visual.two_view import Residuals, tangent_of
-from slam.geometry.epipolar import UnitRelativePose
+from slam.geometry.multiview import UnitRelativePose
 from slam.geometry.robust import mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray
 

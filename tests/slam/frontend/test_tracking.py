@@ -11,7 +11,7 @@ import pytest
 
 from slam.frames import Frame, Intrinsics
 from slam.frontend.tracking import CornerTracker, PredictedFlow, Tracks
-from slam.geometry.epipolar import UnitRelativePose
+from slam.geometry.multiview import UnitRelativePose
 
 SHIFT_PX = 4
 CAMERA = Intrinsics(320, 120, 240.0, 240.0, 160.0, 40.0)

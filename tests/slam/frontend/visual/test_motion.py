@@ -25,7 +25,7 @@ from slam.frontend.visual.motion import (
     step_noise,
 )
 from slam.geometry import se3
-from slam.geometry.epipolar import UnitRelativePose
+from slam.geometry.multiview import UnitRelativePose
 from slam.geometry.se3 import from_rotation_vector
 
 NO_NOISE = np.zeros(6)

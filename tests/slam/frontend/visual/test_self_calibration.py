@@ -10,7 +10,7 @@ import pytest
 
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry import se3
-from slam.geometry.epipolar import UnitRelativePose, triangulated_nearness
+from slam.geometry.multiview import UnitRelativePose, triangulated_nearness
 
 NOISE_PX = 0.2
 FOCAL_PX = 240.0

@@ -20,7 +20,7 @@ from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses, runs
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
 from slam.frontend.scale import Scale
-from slam.frontend.visual.motion import Steps, step_noise, triangulated
+from slam.frontend.visual.motion import step_noise, triangulated
 from slam.geometry.robust import MAD_TO_SIGMA, running_median
 from slam.geometry.se3 import FloatArray, chain, compose, from_rotation_vector, invert, rigid, tangent
 
@@ -47,7 +47,15 @@ def make_factors(
     those of image geometry. What the pose network measured is a line in the log of this ``level``.
     """
     maps = drive.map_poses
-    geometric = _geometric(drive.steps, scale)
+    geometric = []
+    noise = step_noise(triangulated(drive.steps), len(scale.per_frame))
+    for ends, motion in drive.steps.items():
+        length = scale.lengths.get(ends)
+        if motion.is_triangulated and length is not None:
+            pose = motion.with_length(*length, noise[ends])
+            geometric.append(replace(pose, student_t_dof=STUDENT_T_DOF))
+        else:  # its length is that by learned depth
+            geometric.append(scale.scaled(motion.relative_pose))
     by_keyframes = scaled_poses(maps.poses, maps, scale)
     steps = network_steps(drive.trusted)
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
@@ -96,20 +104,6 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
 def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
     """After a gap, a place in the map is known better than any motion over the gap; the network is known least."""
     return factor.source == KEYFRAME_SOURCE, factor.source != NETWORK_SOURCE, factor.from_index
-
-
-def _geometric(steps: Steps, scale: Scale) -> list[RelativePose]:
-    """Every step of image geometry: with its own length where that was measured, else by learned depth."""
-    noise = step_noise(triangulated(steps), len(scale.per_frame))
-    factors = []
-    for ends, motion in steps.items():
-        length = scale.lengths.get(ends)
-        if not motion.is_triangulated or length is None:
-            factors.append(scale.scaled(motion.relative_pose))
-            continue
-        pose = motion.with_length(*length, noise[ends])
-        factors.append(replace(pose, student_t_dof=STUDENT_T_DOF))
-    return factors
 
 
 @dataclass(frozen=True)

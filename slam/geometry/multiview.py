@@ -64,8 +64,8 @@ def ransac_order(count: int, seed: int) -> NDArray[np.intp]:
 
 def consensus(
     points: FloatArray, pixels: FloatArray, K: FloatArray, iterations: int, reprojection_px: float, seed: int = 0
-) -> tuple[FloatArray, NDArray[np.intp]] | None:
-    """``T_camera_world`` and rows of the inliers with most support, or None.
+) -> tuple[FloatArray, NDArray[np.intp]]:
+    """``T_camera_world`` and rows of the inliers with most support; the identity and none where no pose has any.
 
     Samples of three points (OpenCV's USAC, without its local optimisation, which `resect` makes needless).
 
@@ -86,7 +86,7 @@ def consensus(
         points[order], pixels[order], K.copy(), None, params=params
     )
     if not is_solved or chosen is None:
-        return None
+        return np.eye(4), order[:0]
     return make(rotation_matrix(rotation.ravel()), translation.ravel()), order[chosen.ravel()]
 
 
@@ -146,9 +146,9 @@ def _best(
         other = _refined(guess, points, spread, pixels, K, votes)
         best = max(best, other, key=lambda pose: _support(pose, votes))
     if not is_sure(best):
-        start = consensus(points[votes], pixels[votes], K, _SAMPLES, INLIER_PX, seed)
-        if start is not None:
-            other = _refined(start[0], points, spread, pixels, K, votes)
+        start, inliers = consensus(points[votes], pixels[votes], K, _SAMPLES, INLIER_PX, seed)
+        if len(inliers):
+            other = _refined(start, points, spread, pixels, K, votes)
             best = max(best, other, key=lambda pose: _support(pose, votes))
     return best
 
@@ -300,10 +300,7 @@ def unit_pose_by_pnp(
     if known.sum() < _LEAST_CONSENSUS:
         return None
     points = rays_previous[known] * depth_previous[known, None]
-    pose = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
-    if pose is None:
-        return None
-    T_current_previous, _ = pose
+    T_current_previous, _ = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
     length = float(np.linalg.norm(T_current_previous[:3, 3]))
     return UnitRelativePose(T_current_previous[:3, :3], T_current_previous[:3, 3] / length) if length > 0 else None
 

@@ -174,11 +174,11 @@ class LoopVerifier:
         points_known, pixels_known = points[known].astype(np.float64), pixels[known].astype(np.float64)
         if len(known) < thresholds.min_inliers:
             return f"only {len(known)} matches have a trusted depth"
-        start = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, thresholds.reprojection_px, self._seed)
-        count = 0 if start is None else len(start[1])
-        if start is None or count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(known):
+        tolerance, iterations = thresholds.reprojection_px, _RANSAC_ITERATIONS
+        T_start, inliers = consensus(points_known, pixels_known, K, iterations, tolerance, self._seed)
+        count = len(inliers)
+        if count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(known):
             return f"only {count} of {len(known)} matches are inliers"
-        T_start, inliers = start
         extent = pixels_known[inliers].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
             return f"{count} inliers in a small part of the image"

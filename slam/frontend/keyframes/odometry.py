@@ -122,17 +122,12 @@ class KeyframeOdometry:
         last keyframe has been learned, if it has any.
         """
         self._follow(frame)
-        lost = self._lost_map() if self._relocalises else None
-        if lost is None:
-            self._relocaliser = None
-        else:
-            self._relocalise(lost, frame)
-
-    def _lost_map(self) -> LocalMap | None:
-        """The map in which the camera was lost, until it is found again or another map has points."""
         started = [segment.map for segment in self.segments if segment.started]
-        is_lost = bool(started) and (self._lost > 0 or not self.segments[-1].started)
-        return started[-1] if is_lost else None
+        # until the camera is found again in the map in which it was lost, or another map has points
+        if self._relocalises and started and (self._lost > 0 or not self.segments[-1].started):
+            self._relocalise(started[-1], frame)
+        else:
+            self._relocaliser = None
 
     def _relocalise(self, lost: LocalMap, frame: Frame) -> None:
         """Look for the camera in the lost map; where it is found, the map goes on with this frame as a keyframe."""
@@ -155,7 +150,7 @@ class KeyframeOdometry:
         self._T_camera_world, self._T_last_step, self._lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
         pixels = in_middle_row(pixels, self._turn_rate, self._intrinsics)
-        segment.frames.append(self._tracked(frame, track_ids, pixels))
+        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
 
     def _follow(self, frame: Frame) -> None:
         before, self._small = self._small, small_image(frame.grey)
@@ -177,7 +172,7 @@ class KeyframeOdometry:
         if turn.correlation > _SURE_CORRELATION and not self._lost:
             self._T_camera_world = compose(self._T_last_step, self._T_camera_world)
             self._add_keyframe(segment, frame, *_NOTHING)
-            segment.frames.append(self._tracked(frame, *_NOTHING))
+            segment.frames.append(TrackedFrame(frame.index, *_NOTHING, self._T_camera_world))
             return
         self._lost += 1
         segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
@@ -252,7 +247,7 @@ class KeyframeOdometry:
             if parallax > _YOUNG_PARALLAX_RATIO:
                 self._check_first_motion(segment, track_ids, pixels)
             self._add_keyframe(segment, frame, track_ids, places)
-        segment.frames.append(self._tracked(frame, track_ids, pixels))
+        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
         return True
 
     def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
@@ -333,9 +328,6 @@ class KeyframeOdometry:
         """Keep an event and log it."""
         self.events.append(TrackingEvent(frame, event, other, support))
         logger.info("%s", self.events[-1])
-
-    def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
-        return TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world)
 
 
 class Relocaliser:

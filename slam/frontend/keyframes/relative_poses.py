@@ -214,7 +214,11 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
     own = np.array([-float(np.median(np.log(r))) if len(r) >= _LEAST_DEPTHS else np.nan for r in known])
     if not np.isfinite(own).any():
         return np.ones(len(own)), np.ones(len(own))
-    weight = np.where(np.isfinite(own), 0.5 / _SHARED / _scatter(own) ** 2, 0.0)
+    # the scatter of the units of learned depth about that of the map, by keyframes that share no error
+    apart = own[_SHARED:] - own[:-_SHARED]
+    apart = apart[np.isfinite(apart)]
+    usual = float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA)) if len(apart) >= _SHARED else _SIGMA
+    weight = np.where(np.isfinite(own), 0.5 / _SHARED / usual**2, 0.0)
     own = np.nan_to_num(own)
     system = np.zeros((2, len(own)))
     system[1] = weight
@@ -223,15 +227,6 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
     system[1, :-1] += carried**-2.0
     walk = np.asarray(solveh_banded(system[-len(own) :], weight * own))
     return np.exp(walk), np.exp(np.where(weight > 0.0, walk - own, 0.0))
-
-
-def _scatter(logarithms: FloatArray) -> float:
-    """Of the units of learned depth about that of the map, by keyframes that share no error."""
-    apart = logarithms[_SHARED:] - logarithms[:-_SHARED]
-    apart = apart[np.isfinite(apart)]
-    if len(apart) < _SHARED:
-        return _SIGMA
-    return float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA))
 
 
 def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0) -> list[float]:

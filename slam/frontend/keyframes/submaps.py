@@ -68,7 +68,13 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     begun, carries = np.flatnonzero(sigmas < _BEGUN), sigmas < _CARRIED
     carries[: begun[0] if len(begun) else None] = True  # before points have parallax
     number = np.concatenate([[0], np.cumsum(~(carries & tied))])
-    pace = _pace([pair for pair, is_tied in zip(pairwise(keyframes), tied, strict=True) if is_tied])
+    # the median way of the camera from frame to frame between keyframes that points tie; 0 without any
+    paces = [
+        np.linalg.norm((a.T_camera_world @ invert(b.T_camera_world))[:3, 3]) / (b.index - a.index)
+        for (a, b), is_tied in zip(pairwise(keyframes), tied, strict=True)
+        if is_tied
+    ]
+    pace = float(np.median(paces)) if paces else 0.0
     runs = [rows for n in range(number[-1] + 1) if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES]
     if not runs:
         return [segment]
@@ -103,12 +109,6 @@ def _held(segment: MapSegment, carried: FloatArray) -> MapSegment:
     pairs = zip(held.map.keyframes, corrections, strict=True)
     held.map.keyframes = [replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs]
     return held
-
-
-def _pace(pairs: Sequence[tuple[TrackedKeyframe, TrackedKeyframe]]) -> float:
-    """The median way of the camera from frame to frame between keyframes; 0 without any."""
-    steps = [(a.T_camera_world @ invert(b.T_camera_world), b.index - a.index) for a, b in pairs]
-    return float(np.median([np.linalg.norm(T[:3, 3]) / frames for T, frames in steps])) if steps else 0.0
 
 
 def _turn(keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, pace: float | None = None) -> RelativePose:
@@ -169,8 +169,20 @@ def join(
     keyframes = united.map.keyframes
     tracks = _merged_tracks(keyframes, len(united.map.points), shared)
     joined = _renumbered(united, tracks)
-    _adjust_all(joined.map, intrinsics)
-    return joined, [_kept_ratio(*pair, keyframes, joined.map.keyframes, tracks) for pair in shared]
+    everything = range(len(keyframes))
+    for limit in _OUTLIER_LIMITS:
+        sightings, track_ids = joined.map.sightings(everything, np.isfinite(joined.map.points[:, 0]), intrinsics)
+        gone, _ = joined.map.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
+        outliers = sum(map(len, gone))
+        logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)
+    kept_ratios = []
+    for earlier, later, corners in shared:
+        seen = [
+            np.isin(tracks[keyframes[row].track_ids[rows]], joined.map.keyframes[row].track_ids)
+            for row, rows in zip((earlier, later), corners.T, strict=True)
+        ]
+        kept_ratios.append(float(np.mean(seen[0] & seen[1])))
+    return joined, kept_ratios
 
 
 def moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -> MapSegment:
@@ -243,28 +255,3 @@ def _renumbered(segment: MapSegment, tracks: TrackIds) -> MapSegment:
     points[tracks[lonely]] = points[lonely]
     frames = [replace(frame, track_ids=tracks[frame.track_ids]) for frame in segment.frames]
     return MapSegment(LocalMap(keyframes, points), frames, True, segment.turns)
-
-
-def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
-    """Adjust all keyframes but the first, in rounds between which outliers are taken out."""
-    everything = range(len(local.keyframes))
-    for limit in _OUTLIER_LIMITS:
-        sightings, track_ids = local.sightings(everything, np.isfinite(local.points[:, 0]), intrinsics)
-        gone, _ = local.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
-        outliers = sum(map(len, gone))
-        logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)
-
-
-def _kept_ratio(
-    earlier: int,
-    later: int,
-    corners: NDArray[np.intp],
-    before: Sequence[TrackedKeyframe],
-    after: Sequence[TrackedKeyframe],
-    tracks: TrackIds,
-) -> float:
-    seen = [
-        np.isin(tracks[before[row].track_ids[rows]], after[row].track_ids)
-        for row, rows in zip((earlier, later), corners.T, strict=True)
-    ]
-    return float(np.mean(seen[0] & seen[1]))

@@ -330,12 +330,11 @@ class VisualOdometry:
         corrected = self.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
-        start = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
-        count = 0 if start is None else len(start[1])
-        if start is None or count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
+        T_start, inliers = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
+        count = len(inliers)
+        if count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
             return Failed(f"little parallax, and only {known_corners} agree with the learned depth")
-        T_start, inliers = start
         resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
         self._fitted = tracks.track_ids[known][inliers]
         length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))

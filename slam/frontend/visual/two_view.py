@@ -292,7 +292,12 @@ class Residuals:
         The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the
         motion by the square of the corners' noise.
         """
-        essential = _essential(unit_pose, tangent)
+        # E = hat(t) R and its five derivatives
+        essential = np.empty((6, 3, 3))
+        essential[0] = hat = (unit_pose.direction @ _HATS).reshape(3, 3)
+        essential[1:4] = hat @ _HATS.reshape(3, 3, 3)
+        essential[4:] = (tangent.T @ _HATS).reshape(2, 3, 3)
+        essential = essential @ unit_pose.R_current_previous
         algebraic = essential.reshape(6, 9) @ self._both
         # squared lengths of E x and E^T x' without their last coefficients, and half their derivatives
         lines_current = essential[:, :2].swapaxes(1, 2) @ essential[0, :2]
@@ -339,15 +344,6 @@ def tangent_of(direction: FloatArray) -> FloatArray:
     a = -1.0 / (sign + z)
     b = x * y * a
     return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
-
-
-def _essential(unit_pose: UnitRelativePose, tangent: FloatArray) -> FloatArray:
-    """``E = hat(t) R`` and its five derivatives, ``(6, 3, 3)``."""
-    essential = np.empty((6, 3, 3))
-    essential[0] = across = (unit_pose.direction @ _HATS).reshape(3, 3)
-    essential[1:4] = across @ _HATS.reshape(3, 3, 3)
-    essential[4:] = (tangent.T @ _HATS).reshape(2, 3, 3)
-    return np.asarray(essential @ unit_pose.R_current_previous)
 
 
 @dataclass(frozen=True)

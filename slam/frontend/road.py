@@ -160,7 +160,12 @@ class RoadHomography:
 
         def filtered() -> list[_Layer]:
             grey = frame.grey[self._top_row :].astype(np.float32)
-            local = grey - _gradual(grey, _gradual_px(self._intrinsics))
+            # what changes slowly, by a blur that is computed in a smaller image where it is wide
+            sigma_px = _gradual_px(self._intrinsics)
+            ratio = max(int(sigma_px) // 2, 1)
+            size = max(grey.shape[1] // ratio, 1), max(grey.shape[0] // ratio, 1)
+            small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio)
+            local = grey - np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
             coarse = cv2.GaussianBlur(local, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
             return [np.asarray(cv2.merge([layer, *slopes_of(layer)])) for layer in (coarse, grey)]
 
@@ -323,14 +328,6 @@ def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, leng
     return np.asarray(np.linalg.solve(information + prior + 1e-9 * np.eye(3), right))
 
 
-def _gradual(grey: _Layer, sigma_px: float) -> _Layer:
-    """What changes slowly over an image, by a blur that is computed in a smaller image where it is wide."""
-    ratio = max(int(sigma_px) // 2, 1)
-    size = max(grey.shape[1] // ratio, 1), max(grey.shape[0] // ratio, 1)
-    small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio)
-    return np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
-
-
 def _gradual_px(intrinsics: Intrinsics) -> float:
     """Sigma of the blur that leaves what changes slowly over the image, in pixels."""
     return max(0.01 * intrinsics.fx, 1.5)
@@ -387,7 +384,7 @@ class GroundPlaneFitter:
         scaled_normal = _ransac(rays, inverse_depth, self._seed)
         if scaled_normal is None:
             return Failed(f"no plane within {_MAX_PLANE_TILT_DEG:g} deg of level in front of the car")
-        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal, _INLIER_RELATIVE_DEPTH)
+        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
         height = 1.0 / float(np.linalg.norm(scaled_normal))
         normal = scaled_normal * height
         inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
@@ -448,12 +445,12 @@ def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) ->
     return np.asarray(np.abs(relative, out=relative) < _INLIER_RELATIVE_DEPTH)
 
 
-def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray, sigma: float) -> FloatArray:
+def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray) -> FloatArray:
     """Refine ``n / h`` by least squares with Cauchy weights on the relative error of inverse depth."""
     for _ in range(_REWEIGHTINGS):
         predicted = np.maximum(rays @ plane, 1e-9)
         residual = inverse_depth / predicted - 1.0
-        weights = 1.0 / (predicted**2 * (1.0 + (residual / (0.5 * sigma)) ** 2))
+        weights = 1.0 / (predicted**2 * (1.0 + (residual / (0.5 * _INLIER_RELATIVE_DEPTH)) ** 2))
         weighted = rays * weights[:, None]
         plane = np.linalg.solve(weighted.T @ rays, weighted.T @ inverse_depth)
     return plane

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Frame, Grey, Intrinsics, Mask, nearest, resized_mask
 from slam.geometry.multiview import UnitRelativePose
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, invert
 
 Pixels = NDArray[np.float32]
 _TERMINATION = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
@@ -298,7 +298,7 @@ class PredictedFlow:
     @classmethod
     def of(cls, T_previous_current: FloatArray, depth_previous: DepthMap, intrinsics: Intrinsics) -> Self | None:
         """By a pose in the unit of the depth; None where it has no length."""
-        known = UnitRelativePose.of(T_previous_current)
+        known = UnitRelativePose.of(invert(T_previous_current))
         return None if known is None else cls(*known, depth_previous, intrinsics)
 
     def warp_back(self, current: Grey) -> Grey:

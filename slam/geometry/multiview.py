@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.robust import mad_sigma, median
-from slam.geometry.se3 import FloatArray, apply, compose, invert, make, nearest_rotation, rotation_matrix
+from slam.geometry.se3 import FloatArray, apply, compose, make, nearest_rotation, rotation_matrix
 
 LEAST_DEPTH = 1e-6
 MIN_POINTS = 20  # least number of points that give a camera its pose
@@ -222,9 +222,8 @@ class UnitRelativePose:
     direction: FloatArray
 
     @classmethod
-    def of(cls, T_previous_current: FloatArray) -> tuple[Self, float] | None:
-        """That of a pose, and its length; None where it has none."""
-        T_current_previous = invert(T_previous_current)
+    def of(cls, T_current_previous: FloatArray) -> tuple[Self, float] | None:
+        """That of a transform, and its length; None where it has none."""
         length = float(np.linalg.norm(T_current_previous[:3, 3]))
         return (cls(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length) if length > 0 else None
 
@@ -248,11 +247,7 @@ def unit_pose_by_essential(
     if E is None or E.shape != (3, 3) or int(mask.sum()) < _LEAST_CONSENSUS:
         return None
     inliers = mask.ravel().astype(bool)
-    return _in_front(E, rays_previous[inliers], rays_current[inliers])
-
-
-def _in_front(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray) -> UnitRelativePose:
-    """Of the four motions of an essential matrix the one with most points in front of both cameras."""
+    rays_previous, rays_current = rays_previous[inliers], rays_current[inliers]
     R, R_twisted, direction = cv2.decomposeEssentialMat(E)
     unit_poses = [
         UnitRelativePose(rotated, sign * direction.ravel()) for rotated in (R, R_twisted) for sign in (1.0, -1.0)
@@ -301,8 +296,8 @@ def unit_pose_by_pnp(
         return None
     points = rays_previous[known] * depth_previous[known, None]
     T_current_previous, _ = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
-    length = float(np.linalg.norm(T_current_previous[:3, 3]))
-    return UnitRelativePose(T_current_previous[:3, :3], T_current_previous[:3, 3] / length) if length > 0 else None
+    found = UnitRelativePose.of(T_current_previous)
+    return found[0] if found else None
 
 
 def parallax_px(

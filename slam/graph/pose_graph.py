@@ -102,7 +102,12 @@ class PoseGraph:
                 return self._T_world_camera.copy()
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
                 reason = str(error).strip().partition("\n")[0]
-                self._drop_newest_loop(reason)
+                loops = [k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE]
+                if not loops:
+                    raise SlamError(f"the pose graph cannot be solved: {reason}") from error
+                newest = self.relative_poses.pop(loops[-1])
+                self.dropped.append(newest)
+                logger.warning("loop %d -> %d dropped from the graph: %s", *newest.ends, reason)
                 _check_connected(self.relative_poses, len(T_world_camera_initial))
         raise SlamError(f"the pose graph cannot be solved even without {len(self.dropped)} loop edges")
 
@@ -187,14 +192,6 @@ class PoseGraph:
         for frame, position, own in self._positions:
             graph.add(gtsam.GPSFactor(frame, position, robust_noise(own)))
         return graph
-
-    def _drop_newest_loop(self, reason: str) -> None:
-        loops = [k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE]
-        if not loops:
-            raise SlamError(f"the pose graph cannot be solved: {reason}")
-        edge = self.relative_poses.pop(loops[-1])
-        self.dropped.append(edge)
-        logger.warning("loop %d -> %d dropped from the graph: %s", edge.from_index, edge.to_index, reason)
 
 
 def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: FloatArray) -> FloatArray:

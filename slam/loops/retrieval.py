@@ -66,7 +66,14 @@ class FeatureExtractor:
     def corners(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
         detected = self._orb.detect(grey, None)
-        strongest = _strongest_per_cell(detected, grey.shape, _MAX_FEATURES)
+        pixels = np.array([k.pt for k in detected]).reshape(-1, 2)
+        response = np.array([k.response for k in detected])
+        column, row = (pixels // _CELL_PX).astype(int).T
+        cell = row * (grey.shape[1] // _CELL_PX + 1) + column
+        # the best of every cell first, then the second best, and so on
+        by_cell = np.lexsort((-response, cell))
+        rank = np.arange(len(by_cell)) - np.searchsorted(cell[by_cell], cell[by_cell])
+        strongest = by_cell[np.lexsort((-response[by_cell], rank))][:_MAX_FEATURES]
         chosen, descriptors = self._orb.compute(grey, [detected[k] for k in strongest])
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
@@ -95,20 +102,6 @@ def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
     for a, b in zip(words_first, words_second, strict=True):
         differing += np.bitwise_count(a[:, None] ^ b)
     return differing.astype(np.float32)
-
-
-def _strongest_per_cell(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
-    """Rows of at most ``count`` keypoints: the best of every cell first, then the second best, and so on."""
-    if len(keypoints) == 0:
-        return np.zeros(0, np.intp)
-    pixels = np.array([k.pt for k in keypoints])
-    response = np.array([k.response for k in keypoints])
-    cell = (pixels[:, 1] // _CELL_PX).astype(int) * (shape[1] // _CELL_PX + 1) + (pixels[:, 0] // _CELL_PX).astype(int)
-    by_cell = np.lexsort((-response, cell))
-    first_of_cell = np.searchsorted(cell[by_cell], cell[by_cell])
-    rank = np.arange(len(by_cell)) - first_of_cell
-    order = by_cell[np.lexsort((-response[by_cell], rank))]
-    return np.asarray(order[:count])
 
 
 def _directions_deg(grey: Grey, pixels: NDArray[np.floating[Any]]) -> FloatArray:

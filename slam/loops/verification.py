@@ -159,7 +159,9 @@ class LoopVerifier:
         if rotation_deg > self.thresholds.agreement_deg or translation_ratio > self.thresholds.agreement_ratio:
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
             return refused(reason, inliers)
-        T_middle = _halfway(invert(forward.T_camera_points), T_again)
+        T_forward = invert(forward.T_camera_points)
+        half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(T_forward[:3, :3].T @ T_again[:3, :3]).as_rotvec())
+        T_middle = make(T_forward[:3, :3] @ half.as_matrix(), 0.5 * (T_forward[:3, 3] + T_again[:3, 3]))
         sigmas = self._sigmas(T_middle, depth, difference, forward.sigmas, backward.sigmas * np.repeat([1.0, scale], 3))
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         shared = np.union1d(forward.inliers, backward.inliers)
@@ -225,10 +227,3 @@ def _scale(
     seen_by_first = apply(backward.T_camera_points, points_second[both].astype(np.float64))[:, 2]
     ratios = np.median(seen_by_second / points_second[both, 2]), np.median(points_first[both, 2] / seen_by_first)
     return float(np.sqrt(ratios[0] * ratios[1]))
-
-
-def _halfway(T_a_b: FloatArray, T_a_b_again: FloatArray) -> FloatArray:
-    """The mean of two close measurements of one transform."""
-    R_a_b = T_a_b[:3, :3]
-    half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(R_a_b.T @ T_a_b_again[:3, :3]).as_rotvec())
-    return make(R_a_b @ half.as_matrix(), 0.5 * (T_a_b[:3, 3] + T_a_b_again[:3, 3]))

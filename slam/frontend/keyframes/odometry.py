@@ -164,7 +164,10 @@ class KeyframeOdometry:
             return
         segment = self.segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
-        self._measure_turn(segment, track_ids, pixels, since)
+        if self._intrinsics.readout_s:  # how fast the camera turns, for a rolling shutter
+            last = segment.frames[-1] if segment.frames else segment.map.keyframes[-1]
+            _, a, b = np.intersect1d(last.track_ids, track_ids, assume_unique=True, return_indices=True)
+            self._turn_rate = measured_turn(last.pixels[a], pixels[b], since, self._turn_rate, self._intrinsics)
         if self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
@@ -316,14 +319,6 @@ class KeyframeOdometry:
         self._slipped = np.zeros(len(self._places), np.bool_)
         self._spread = None
 
-    def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
-        """How fast the camera turns, for a rolling shutter."""
-        if not self._intrinsics.readout_s:
-            return
-        before = segment.frames[-1] if segment.frames else segment.map.keyframes[-1]
-        _, a, b = np.intersect1d(before.track_ids, track_ids, assume_unique=True, return_indices=True)
-        self._turn_rate = measured_turn(before.pixels[a], pixels[b], seconds, self._turn_rate, self._intrinsics)
-
     def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
         """Keep an event and log it."""
         self.events.append(TrackingEvent(frame, event, other, support))
@@ -347,7 +342,15 @@ class Relocaliser:
             ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)`` where the image sees
             them, and the frame of the keyframe with most of them.
         """
-        keyframes, rows, points = self._matched(image)
+        # keyframes (M,), rows of their corners and of the image's (M, 2), and points in the map (M, 3)
+        parts = [(np.zeros(0, np.intp), np.zeros((0, 2), np.intp), np.zeros((0, 3)))]
+        for keyframe in self._index.nearest(image, _PLACES_TRIED):
+            view = self._views[keyframe]
+            pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
+            pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
+            in_map = apply(self._T_map_camera[keyframe], view.points[pairs[:, 0]].astype(np.float64))
+            parts.append((np.full(len(pairs), keyframe), pairs, in_map))
+        keyframes, rows, points = (np.concatenate(column) for column in zip(*parts, strict=True))
         best: Sighting | None = None
         for keyframe in np.unique(keyframes):
             here = keyframes == keyframe
@@ -370,18 +373,6 @@ class Relocaliser:
         tracks, once = np.unique(tracks, return_index=True)
         place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
         return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
-
-    def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
-        """Keyframes ``(M,)``, rows of their corners and of the image's ``(M, 2)``, and points in the map ``(M, 3)``."""
-        keyframes, rows, points = [np.zeros(0, np.intp)], [np.zeros((0, 2), np.intp)], [np.zeros((0, 3))]
-        for keyframe in self._index.nearest(image, _PLACES_TRIED):
-            view = self._views[keyframe]
-            pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
-            pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
-            keyframes.append(np.full(len(pairs), keyframe))
-            rows.append(pairs)
-            points.append(apply(self._T_map_camera[keyframe], view.points[pairs[:, 0]].astype(np.float64)))
-        return np.concatenate(keyframes), np.concatenate(rows), np.concatenate(points)
 
 
 def first_motion(

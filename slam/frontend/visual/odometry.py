@@ -129,14 +129,19 @@ class VisualOdometry:
         """
         previous, current = self._reduced(previous), self._reduced(current)
         depth_previous_unscaled = self._reduced_depth(depth_previous_unscaled)
-        flow = self._predicted_flow(previous, current, depth_previous_unscaled)
+        last, flow = self._last, None
+        # by the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames
+        if last is not None and last.ends == (2 * previous.index - current.index, previous.index):
+            flow = PredictedFlow.of(last.relative_pose.T_from_to, depth_previous_unscaled, self._intrinsics)
         tracks = self._tracker.track(previous, current, flow, standing)
         if len(tracks) < MIN_INLIERS:
             measured: Motion | Failed = Failed(f"only {len(tracks)} corners could be tracked")
         else:
             learned = nearest_depth(depth_previous_unscaled, tracks.previous)
             depth = trusted_depth(learned, height_unscaled)
-            ends, votes = (previous.index, current.index), self._votes(tracks)
+            ends, votes = (previous.index, current.index), np.isin(tracks.track_ids, self._fitted)
+            if votes.sum() < MIN_INLIERS:  # few are left that fitted the last motion
+                votes[:] = True
             measured = (
                 self._still(ends, tracks, votes, depth)
                 or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
@@ -183,20 +188,6 @@ class VisualOdometry:
             return RelativeRotation(first.index, last.index, two_view.unit_pose.R_current_previous, sigmas)
 
         return measure
-
-    def _predicted_flow(self, previous: Frame, current: Frame, depth_previous: DepthMap) -> PredictedFlow | None:
-        """By the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames."""
-        last = self._last
-        if last is None or last.ends[1] != previous.index:
-            return None
-        if last.ends[1] - last.ends[0] != current.index - previous.index:
-            return None
-        return PredictedFlow.of(last.relative_pose.T_from_to, depth_previous, self._intrinsics)
-
-    def _votes(self, tracks: Tracks) -> NDArray[np.bool_]:
-        """Which tracks ``(M,)`` have the vote: all, where few are left that fitted the last motion."""
-        fitted = np.isin(tracks.track_ids, self._fitted)
-        return fitted if fitted.sum() >= MIN_INLIERS else np.ones(len(tracks), dtype=bool)
 
     def _matches(
         self,

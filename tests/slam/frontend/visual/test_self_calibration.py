@@ -106,7 +106,7 @@ def shown(stated: float, turn_deg: float) -> FocalLength:
         previous, current = world, moved / moved[:, 2:]
         current[:, :2] += rng.normal(0, 0.1, (200, 2)) / FOCAL_PX
         scale = np.array([FOCAL_PX / stated, FOCAL_PX / stated, 1.0])
-        unit_pose, _ = UnitRelativePose.of(se3.invert(T))
+        unit_pose, _ = UnitRelativePose.of(T)
         found = found.with_step(previous * scale, current * scale, unit_pose, stated)
     return found
 

@@ -23,8 +23,7 @@ from slam.frames import Frame, Image, Intrinsics, View
 from slam.geometry.multiview import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.places import Places, PlaceStructure
-from slam.loops.retrieval import FeatureExtractor, PlaceIndex, hamming
-from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
+from slam.loops.recognition import OF_FRAMES, OF_KEYFRAMES, FeatureExtractor, PlaceIndex, hamming, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES

@@ -19,8 +19,7 @@ from erfsfm.common.processes import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
-from slam.loops.retrieval import PlaceIndex
-from slam.loops.verification import OF_FRAMES, Loop, LoopThresholds, LoopVerifier, RejectedLoop
+from slam.loops.recognition import OF_FRAMES, Loop, LoopThresholds, LoopVerifier, PlaceIndex, RejectedLoop
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
 from slam.loops.places import PlaceStructure
-from slam.loops.verification import OF_KEYFRAMES
+from slam.loops.recognition import OF_KEYFRAMES
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.run import Recorder, SlamPipeline

@@ -20,7 +20,7 @@ from slam.frontend.scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
 from slam.graph.pose_graph import RelativeSimilarity, optimise_similarities
 from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
-from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
+from slam.loops.recognition import OF_KEYFRAMES, Loop, LoopVerifier
 
 logger = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
-from slam.loops.retrieval import FeatureExtractor
+from slam.loops.recognition import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.storage.spill import SpillFile

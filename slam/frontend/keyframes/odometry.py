@@ -55,8 +55,7 @@ from slam.geometry.multiview import (
     unit_poses_by_homography,
 )
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.retrieval import PlaceIndex, describe
-from slam.loops.verification import OF_KEYFRAMES, LoopVerifier, Sighting, matches
+from slam.loops.recognition import OF_KEYFRAMES, LoopVerifier, PlaceIndex, Sighting, describe, matches
 
 logger = logging.getLogger(__name__)
 

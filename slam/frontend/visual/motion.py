@@ -181,6 +181,10 @@ class MotionPrior:
     axis: FloatArray
     axis_sigma: float
 
+    def deviation(self, direction: FloatArray) -> float:
+        """Angle of a ``direction`` ``(3,)`` from the axis, sigmas; forwards and backwards are equal."""
+        return float(np.arccos(min(abs(float(self.axis @ direction)), 1.0))) / self.axis_sigma
+
 
 @dataclass(frozen=True)
 class MotionHistory:

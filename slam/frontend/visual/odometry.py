@@ -408,36 +408,23 @@ def most_credible(
     balance = []
     for step in estimated:
         speed = step.speed(height_unscaled, seconds)
-        votes = [history.is_possible_speed(speed, seconds), _fits_ratio(step, speed, history)]
-        votes += [_fits_road(step, matches, height_unscaled), _fits_axis(step, history)]
-        balance.append(sum(1 if vote else -1 for vote in votes if vote is not None))
+        is_possible = history.is_possible_speed(speed, seconds)
+        votes = [] if is_possible is None else [is_possible]
+        # points of this step and the one before have the ratio of lengths that learned depth has
+        if step.motion.length_ratio is not None and history.speeds and np.isfinite(speed / history.speeds[-1]):
+            ratio, _ = step.motion.length_ratio
+            votes.append(bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT))
+        # the corners on the road are triangulated at the camera's height below it
+        road = matches.on_road & step.two_view.inliers
+        if height_unscaled is not None and road.sum() >= _LEAST_ROAD_CORNERS:
+            rays = matches.rays_previous[road]
+            depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
+            height = float(np.median(depth * rays[:, 1])) * step.motion.length_unscaled
+            votes.append(bool(abs(np.log(max(height, 1e-9) / height_unscaled)) < _AGREEMENT))
+        # the direction is about the median of the last hundred steps, which a few wrong ones do not change
+        prior = history.prior()
+        if np.isfinite(prior.axis_sigma):
+            votes.append(prior.deviation(step.two_view.unit_pose.direction) < 3.0)
+        balance.append(sum(1 if vote else -1 for vote in votes))
     best = int(np.argmax(balance))
     return estimated[best] if balance[best] >= 0 else None
-
-
-def _fits_ratio(step: Step, speed: float, history: MotionHistory) -> bool | None:
-    """Whether points of this step and the one before have the ratio of lengths that learned depth has."""
-    if step.motion.length_ratio is None or not history.speeds or not np.isfinite(speed / history.speeds[-1]):
-        return None
-    ratio, _ = step.motion.length_ratio
-    return bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT)
-
-
-def _fits_axis(step: Step, history: MotionHistory) -> bool | None:
-    """Whether the direction is about the median of the last hundred steps, which a few wrong ones do not change."""
-    prior = history.prior()
-    if not np.isfinite(prior.axis_sigma):
-        return None
-    cosine = abs(float(prior.axis @ step.two_view.unit_pose.direction))
-    return bool(np.arccos(min(cosine, 1.0)) < 3.0 * prior.axis_sigma)
-
-
-def _fits_road(step: Step, matches: Matches, height_unscaled: float | None) -> bool | None:
-    """Whether the corners on the road are triangulated at the camera's height below it."""
-    road = matches.on_road & step.two_view.inliers
-    if height_unscaled is None or road.sum() < _LEAST_ROAD_CORNERS:
-        return None
-    rays = matches.rays_previous[road]
-    depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
-    height = float(np.median(depth * rays[:, 1]))
-    return bool(abs(np.log(max(height * step.motion.length_unscaled, 1e-9) / height_unscaled)) < _AGREEMENT)

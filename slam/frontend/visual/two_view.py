@@ -257,12 +257,8 @@ def _with_first_sigma(matches: Matches, motions: Sequence[UnitRelativePose | Non
 
 
 def _support(candidate: TwoViewEstimate, votes: NDArray[np.bool_], prior: MotionPrior) -> float:
-    """Number of votes of inliers that agree with learned depth, less the cost of leaving the usual axis.
-
-    Forwards and backwards are equal.
-    """
-    cosine = abs(float(prior.axis @ candidate.unit_pose.direction))
-    deviation = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
+    """Number of votes of inliers that agree with learned depth, less the cost of leaving the usual axis."""
+    deviation = prior.deviation(candidate.unit_pose.direction)
     return float(candidate.agreeing[votes].sum()) - 0.5 * deviation**2 / _OUTLIER_COST
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Image, Intrinsics
-from slam.loops.verification import Loop
+from slam.loops.recognition import Loop
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.page import Picture
 

@@ -19,7 +19,7 @@ from slam.formats.trajectory import Trajectory, associate, read_trajectory, writ
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.places import Places
-from slam.loops.retrieval import FeatureExtractor
+from slam.loops.recognition import FeatureExtractor
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES

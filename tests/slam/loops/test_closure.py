@@ -15,8 +15,7 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import LOOP_SOURCE, Frame, Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, rotation_angle
 from slam.loops.closure import MOST_REJECTED, Track, agreeing, close_loops
-from slam.loops.retrieval import FeatureExtractor
-from slam.loops.verification import OF_FRAMES, Loop
+from slam.loops.recognition import OF_FRAMES, FeatureExtractor, Loop
 from slam.pipeline import observer
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline

@@ -13,7 +13,7 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Frame
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.places import Places
-from slam.loops.retrieval import FeatureExtractor
+from slam.loops.recognition import FeatureExtractor
 from slam.results.folder import RunFolder
 from slam.runtime.files import PLACES
 from slam.sequences.simulated import SimulatedSequence

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
-from slam.loops.verification import Loop
+from slam.loops.recognition import Loop
 from slam.mapping.filters import KeyframeDepth
 from slam.results.report.page import Picture
 from slam.results.report.pictures import DepthPictures, loop_pictures

@@ -25,7 +25,7 @@ from slam.frames import (
 )
 from slam.frontend.keyframes.local_map import MapSegment
 from slam.frontend.keyframes.relative_poses import KeyframePoses
-from slam.frontend.road import GroundPlane, RoadStep
+from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.se3 import FloatArray
@@ -96,10 +96,11 @@ class Drive:
     Collected frame by frame, each list and dictionary growing at its end:
         ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
         ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
-        ``roads`` has one entry a frame. ``unusable`` are frames without a measurement, with the reason, ``repeated``
-        frames with the image of the one before, ``moving`` those of them just before which the camera moved.
-        ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as the steps have them.
-        ``maps`` are those of keyframes and ``events`` what became of them; a drive measured by steps alone has none.
+        ``roads`` has one entry a frame, the camera's height over the ground plane. ``unusable`` are frames without a
+        measurement, with the reason, ``repeated`` frames with the image of the one before, ``moving`` those of them
+        just before which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the one that
+        corners show, as the steps have them. ``maps`` are those of keyframes and ``events`` what became of them; a
+        drive measured by steps alone has none.
 
     Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of interpolated
     frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
@@ -112,7 +113,7 @@ class Drive:
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: list[RelativeRotation] = field(default_factory=list)
     failures: list[tuple[int, int, str]] = field(default_factory=list)
-    roads: list[GroundPlane | Failed] = field(default_factory=list)
+    roads: list[float | Failed] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
     unusable: dict[int, str] = field(default_factory=dict)

@@ -348,20 +348,6 @@ def _correlation(a: _Layer, b: _Layer) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
 
 
-@dataclass(frozen=True)
-class GroundPlane:
-    """The road under one camera: its distance, unit normal ``(3,)`` down to it, and inlier ratio in [0, 1]."""
-
-    height_unscaled: float
-    normal: FloatArray
-    inlier_ratio: float
-
-
-def height_of(road: GroundPlane | Failed) -> float | None:
-    """The camera's height over the ground plane of a frame, unscaled; None without one."""
-    return road.height_unscaled if isinstance(road, GroundPlane) else None
-
-
 class GroundPlaneFitter:
     """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
 
@@ -370,10 +356,10 @@ class GroundPlaneFitter:
         self._seed = seed
         self._rows, self._columns, self._rays = _trapezoid(intrinsics)
 
-    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> GroundPlane | Failed:
-        """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics, without the bias by its ``error``.
+    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | Failed:
+        """The camera's unscaled height over the plane of learned z-depth ``(H, W)`` without the bias by its ``error``.
 
-        Unknown depth is left out.
+        The depth is at the size of the intrinsics; where it is unknown it is left out.
         """
         depth = error.corrected(depth_unscaled[self._rows, self._columns].astype(np.float64))
         inverse_depth = 1.0 / np.maximum(depth, 1e-9)
@@ -386,13 +372,12 @@ class GroundPlaneFitter:
             return Failed(f"no plane within {_MAX_PLANE_TILT_DEG:g} deg of level in front of the car")
         scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
         height = 1.0 / float(np.linalg.norm(scaled_normal))
-        normal = scaled_normal * height
         inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
-        if normal[1] < np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)):
+        if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)):
             return Failed(f"the plane in front of the car is tilted by more than {_MAX_PLANE_TILT_DEG:g} deg")
         if inlier_ratio < _MIN_INLIER_RATIO:
             return Failed(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
-        return GroundPlane(height, normal, inlier_ratio)
+        return height
 
 
 def _trapezoid(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:

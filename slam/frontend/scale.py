@@ -26,7 +26,6 @@ from scipy.linalg import solveh_banded
 from slam.config.sections import ScaleConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.road import GroundPlane
 from slam.frontend.visual.motion import Motion, links, triangulated
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray
@@ -189,9 +188,9 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
         heights = [
-            metres[ends] / motion.length_unscaled * plane.height_unscaled
+            metres[ends] / motion.length_unscaled * height
             for ends, motion in triangulated(drive.steps).items()
-            if ends in metres and isinstance(plane := drive.roads[ends[0]], GroundPlane)
+            if ends in metres and not isinstance(height := drive.roads[ends[0]], Failed)
         ]
     return float(np.median(heights)) if heights else None
 
@@ -205,7 +204,7 @@ def resolve_mode(config: ScaleConfig, camera_height_m: float | None, has_gps: bo
     return "gps" if has_gps else "none"
 
 
-def scale_from_road(roads: Sequence[GroundPlane | Failed], height: float = 1.0) -> ScaleEstimate | Failed:
+def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> ScaleEstimate | Failed:
     """Unit of the camera's ``height`` per unscaled length: metres, or camera heights where it is 1.
 
     The median over the frames without outliers, which are many MADs away.
@@ -274,7 +273,7 @@ def scale_from_distance(
     return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
 
 
-def scale_track(roads: Sequence[GroundPlane | Failed], height: float, estimate: ScaleEstimate) -> FloatArray:
+def scale_track(roads: Sequence[float | Failed], height: float, estimate: ScaleEstimate) -> FloatArray:
     """The scale near each frame ``(N,)``: a running median over ground planes.
 
     The unit of learned depth drifts along a drive. Where the 41 frames around a frame hold too few
@@ -288,9 +287,9 @@ def scale_track(roads: Sequence[GroundPlane | Failed], height: float, estimate: 
     return np.where(counts >= MIN_FRAMES, running_median(ratios, _SMOOTHING_FRAMES), estimate.value)
 
 
-def _ratios(roads: Sequence[GroundPlane | Failed], height: float) -> FloatArray:
+def _ratios(roads: Sequence[float | Failed], height: float) -> FloatArray:
     """The camera's height over that above each ground plane ``(N,)``, NaN without one."""
-    return np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])
+    return np.array([np.nan if isinstance(road, Failed) else height / road for road in roads])
 
 
 @dataclass(frozen=True)

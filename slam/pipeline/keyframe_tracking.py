@@ -17,8 +17,8 @@ from slam.frontend.keyframes.local_map import LocalMap, MapSegment
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import learned_unit
 from slam.frontend.keyframes.submaps import parts_of
-from slam.frontend.road import height_of
 from slam.geometry.se3 import FloatArray, invert
+from slam.runtime.errors import Failed
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
@@ -141,7 +141,7 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
     first = list(islice((motion for motion in drive.motions if motion.is_triangulated), _MOST_STEPS))
     if len(first) < _CLEAR_STEPS:
         return None
-    heights = [height for road in drive.roads if (height := height_of(road)) is not None]
+    heights = [road for road in drive.roads if not isinstance(road, Failed)]
     speeds = [motion.length_unscaled / motion.seconds for motion in first]
     is_fast = bool(heights) and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
     steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])

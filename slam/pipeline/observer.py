@@ -17,7 +17,7 @@ from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, resized_mask
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep, height_of
+from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep
 from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
@@ -202,7 +202,7 @@ class Observer:
     def _has_moved_on(self, step: Motion, frames: int) -> bool:
         """Whether so many more steps as this one leave what the last predicted depth shows."""
         roads = self.drive.roads[: step.ends[1] + 1][-_LAST_ROADS:]
-        height = next((height for road in reversed(roads) if (height := height_of(road)) is not None), math.inf)
+        height = next((road for road in reversed(roads) if not isinstance(road, Failed)), math.inf)
         return frames * step.length_unscaled > _MOVED_ON_HEIGHTS * height
 
     def _predict(self, frame: Frame) -> Future[DepthMap]:
@@ -290,7 +290,7 @@ class Observer:
         with self._stopwatch.stage("road"):
             self.drive.roads[frame.index] = road = self._plane.fit(depth, error)
         self.keyframes.learn(frame, depth)
-        current.depth, current.height = depth, height_of(road)
+        current.depth, current.height = depth, None if isinstance(road, Failed) else road
         views, loops = self.drive.views, self._config.loops
         if loops.enabled and (not views or frame.index - views[-1].index >= _LOOP_STRIDE):
             with self._stopwatch.stage("loops"):
@@ -311,7 +311,8 @@ class Observer:
             self._keep_for_map(recent.frame, recent.depth)
             return recent.depth
         recent.depth = self._predict(recent.frame).result()
-        recent.height = height_of(self._plane.fit(recent.depth, self._odometry.depth_error))
+        road = self._plane.fit(recent.depth, self._odometry.depth_error)
+        recent.height = None if isinstance(road, Failed) else road
         return recent.depth
 
     def _step(self, previous: FrameInWork | None, current: FrameInWork) -> Motion | None:

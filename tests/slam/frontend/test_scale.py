@@ -13,7 +13,7 @@ import pytest
 from slam.config.sections import ScaleConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.road import GroundPlane, RoadStep
+from slam.frontend.road import RoadStep
 from slam.frontend.scale import (
     Scale,
     ScaleEstimate,
@@ -61,7 +61,7 @@ def measured(
 ) -> tuple[Drive, list[RelativePose]]:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
     motions = [Motion(step(ends, UNIT, "essential"), np.eye(6)) for ends in steps]
-    plane: GroundPlane | Failed = GroundPlane(bias * HEIGHT_M * UNIT, DOWN, 1.0) if planes else Failed("dark")
+    plane = bias * HEIGHT_M * UNIT if planes else Failed("dark")
     roads = {ends: RoadStep(metres(ends) / height_m * DOWN, np.eye(3), DOWN, 0.06) for ends in steps} if road else {}
     scans = [step(ends, 1.0, "lidar") for ends in SINGLE[:lidar]]
     return Drive(roads=[plane] * FRAMES, motions=motions, road_steps=roads), scans
@@ -145,7 +145,7 @@ def test_lengths_by_learned_depth_alone_have_the_unit_at_their_first_frames():
     """The unit of learned depth drifts by a tenth."""
     steps = [(k, k + 3) for k in range(0, FRAMES - 1, 3)]
     drifting = np.linspace(1.0, 1.1, FRAMES)
-    planes = [GroundPlane(HEIGHT_M * UNIT / unit, DOWN, 1.0) for unit in drifting]
+    planes = [HEIGHT_M * UNIT / unit for unit in drifting]
     scale = find("camera-height", (replace(measured(road=False, steps=steps)[0], roads=planes), []))
     assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
     for ends in steps:
@@ -200,24 +200,20 @@ def test_lengths_have_the_unit_that_was_measured(mode, road, unit):
     assert scale.in_metres(ScaleEstimate(2.0, 0.1, 9)).unit == "metres"
 
 
-def planes_of(heights) -> list[GroundPlane | Failed]:
-    return [GroundPlane(height, DOWN, 1.0) for height in heights]
-
-
 def test_without_a_height_the_unit_is_the_camera_height():
-    roads = planes_of([0.5] * 9)
+    roads = [0.5] * 9
     assert scale_from_road(roads).value == pytest.approx(2.0)
     assert scale_from_road(roads, 1.65).value == pytest.approx(3.3)
 
 
 def test_too_few_frames_give_no_scale():
-    failure = scale_from_road([*planes_of([0.5] * 3), *[Failed("dark")] * 30], 1.65)
+    failure = scale_from_road([*[0.5] * 3, *[Failed("dark")] * 30], 1.65)
     assert isinstance(failure, Failed) and "only 3 frames" in failure.reason
 
 
 def test_the_scale_track_follows_a_drifting_unit_across_frames_without_a_plane():
     heights = np.where(np.arange(200) < 100, 0.50, 0.52)
-    roads = planes_of(heights)
+    roads = heights.tolist()
     roads[10:40] = [Failed("no road")] * 30
     estimate = scale_from_road(roads, 1.0)
     track = scale_track(roads, 1.0, estimate)

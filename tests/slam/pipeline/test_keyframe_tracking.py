@@ -13,7 +13,6 @@ from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.completion import complete_drive
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.relative_poses import keyframe_poses
-from slam.frontend.road import GroundPlane
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
@@ -30,7 +29,7 @@ def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
         T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
         pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
         motions.append(Motion(pose, np.eye(6), seconds=seconds))
-    return Drive(motions=motions, roads=[GroundPlane(1.0, np.array([0.0, 1.0, 0.0]), 1.0)] * count)
+    return Drive(motions=motions, roads=[1.0] * count)
 
 
 @pytest.mark.parametrize(

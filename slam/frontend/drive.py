@@ -173,34 +173,29 @@ class Drive:
             """The items that begin in the window, of items in order of time that may span a few frames."""
             return list(takewhile(lambda item: start(item) >= first, items))[::-1]
 
+        def moved(motion: Motion) -> Motion:
+            pose, (a, b) = motion.relative_pose, motion.ends
+            return replace(motion, relative_pose=replace(pose, from_index=a - first, to_index=b - first))
+
         return Drive(
             snippets=[
                 replace(s, target=s.target - first, sources=tuple(source - first for source in s.sources))
                 for s in last(reversed(self.snippets), lambda s: min(s.sources))
             ],
-            motions=[
-                replace(motion, relative_pose=_moved(motion.relative_pose, first))
-                for motion in last(reversed(self.motions), lambda m: m.ends[0])
-            ],
+            motions=[moved(motion) for motion in last(reversed(self.motions), lambda m: m.ends[0])],
             road_steps={
                 (ends[0] - first, ends[1] - first): step
                 for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0])
             },
             relative_rotations=[
-                _moved(rotation, first) for rotation in last(reversed(self.relative_rotations), lambda r: min(r.ends))
+                replace(rotation, ends=(rotation.ends[0] - first, rotation.ends[1] - first))
+                for rotation in last(reversed(self.relative_rotations), lambda r: r.ends[0])
             ],
             failures=[(a - first, b - first, why) for a, b, why in last(reversed(self.failures), lambda f: f[0])],
             roads=self.roads[first:],
             unusable={k - first: why for k, why in last(reversed(self.unusable.items()), lambda item: item[0])},
             repeated=[k - first for k in last(reversed(self.repeated), lambda k: k)],
         )
-
-
-_Between = TypeVar("_Between", RelativePose, RelativeRotation)
-
-
-def _moved(measured: _Between, first: int) -> _Between:
-    return replace(measured, from_index=measured.from_index - first, to_index=measured.to_index - first)
 
 
 def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:

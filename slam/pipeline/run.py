@@ -16,7 +16,7 @@ from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame, Predictor, RelativePose
+from slam.frames import Frame, GpsTrack, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
@@ -36,7 +36,6 @@ from slam.frontend.scale import (
     scale_from_reference,
 )
 from slam.frontend.visual.motion import triangulated
-from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.formats.rows import BadRows, in_seconds, text_of
-from slam.geometry.geodesy import GpsTrack
+from slam.frames import GpsTrack
 from slam.runtime.errors import SequenceError
 
 _COLUMNS = ("stamp", "latitude", "longitude", "altitude")

@@ -113,15 +113,9 @@ class RelativeRotation:
     those of its rotation vector in the later camera, radians.
     """
 
-    from_index: int
-    to_index: int
+    ends: Ends
     R_to_from: FloatArray
     sigmas: FloatArray
-
-    @property
-    def ends(self) -> Ends:
-        """Both frames."""
-        return self.from_index, self.to_index
 
 
 def pose_sigmas(T_previous_current: FloatArray, of_unit_pose: FloatArray, length_relative_sigma: float) -> FloatArray:

@@ -280,7 +280,7 @@ def drive(
     sigmas = np.full(3, SIGMA)
     steps = single([off @ small(rng, 0.1 * SIGMA) @ R for R in truth])
     across = [
-        RelativeRotation(k, k + 2, off @ small(rng, baseline_noise) @ truth[k + 1] @ truth[k], sigmas)
+        RelativeRotation((k, k + 2), off @ small(rng, baseline_noise) @ truth[k + 1] @ truth[k], sigmas)
         for k in range(ROTATIONS - 1)
     ]
     return steps, across, truth
@@ -296,7 +296,7 @@ def test_a_relative_rotation_that_is_far_off_is_an_outlier() -> None:
     steps, across, truth = drive(np.zeros(3), 0.1 * SIGMA)
     before = error_deg(smooth_rotations(steps, across), truth)
     wrong = Rotation.from_euler("y", 5.0, degrees=True).as_matrix() @ across[10].R_to_from
-    across[10] = RelativeRotation(10, 12, wrong, across[10].sigmas)
+    across[10] = RelativeRotation((10, 12), wrong, across[10].sigmas)
     assert error_deg(smooth_rotations(steps, across), truth) < before + 0.02
 
 
@@ -332,9 +332,9 @@ def test_steps_that_skip_frames_are_smoothed_like_others() -> None:
     expected = rotations_of(smooth_rotations(steps, across))
     sparse = table_of({(3 * k, 3 * k + 3): R for (k, _), R in rotations_of(steps).items()})
     sparse_across = [
-        RelativeRotation(3 * each.from_index, 3 * each.to_index, each.R_to_from, each.sigmas) for each in across
+        RelativeRotation((3 * each.ends[0], 3 * each.ends[1]), each.R_to_from, each.sigmas) for each in across
     ]
     for (first, _), R in rotations_of(smooth_rotations(sparse, sparse_across)).items():
         np.testing.assert_allclose(R, expected[first // 3, first // 3 + 1], atol=1e-12)
-    ends_inside = [RelativeRotation(k, k + 4, truth[0], np.full(3, SIGMA)) for k in range(0, 60, 3)]
+    ends_inside = [RelativeRotation((k, k + 4), truth[0], np.full(3, SIGMA)) for k in range(0, 60, 3)]
     assert smooth_rotations(sparse, ends_inside) is sparse

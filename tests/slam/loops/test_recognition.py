@@ -7,7 +7,7 @@ import pytest
 
 from slam.frames import LOOP_SOURCE, Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
-from slam.loops import verification
+from slam.loops import recognition
 from slam.loops.closure import Apart, find_candidates
 from slam.loops.recognition import OF_FRAMES, Loop, LoopVerifier, RejectedLoop, hamming
 
@@ -63,7 +63,7 @@ def test_verdict_does_not_depend_on_the_unit(unit: float) -> None:
 
 
 def test_sigmas_grow_with_the_error_of_corners_and_cover_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verification, "_LENGTH_RELATIVE_SIGMA", 1e-6)
+    monkeypatch.setattr(recognition, "_LENGTH_RELATIVE_SIGMA", 1e-6)
     whitened, sizes = [], []
     for sigma_px in (0.3, 1.0):
         for seed in range(12):

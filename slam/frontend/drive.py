@@ -23,7 +23,7 @@ from slam.frames import (
     resized_depth,
     runs,
 )
-from slam.frontend.keyframes.local_map import MapSegment
+from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
@@ -126,7 +126,7 @@ class Drive:
     interpolated: dict[int, str] = field(default_factory=dict)
     gap_steps: list[RelativePose] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
-    maps: list[MapSegment] = field(default_factory=list)
+    maps: list[LocalMap] = field(default_factory=list)
     map_poses: KeyframePoses = field(default_factory=KeyframePoses)
     events: list[TrackingEvent] = field(default_factory=list)
 

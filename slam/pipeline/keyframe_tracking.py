@@ -13,7 +13,7 @@ from erfsfm.common.processes import opencv_threads, usable_cores
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent
 from slam.frontend.drive import LAST_STEPS, Drive
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment
+from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import learned_unit
 from slam.frontend.keyframes.submaps import parts_of
@@ -121,10 +121,10 @@ class KeyframeTracking:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]
         T_before_frame = T_before_map @ invert(T_frame_map)
-        T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
+        T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points))
         return before, T_before_frame
 
-    def maps(self, drive: Drive) -> list[MapSegment]:
+    def maps(self, drive: Drive) -> list[LocalMap]:
         """All parts of maps so far, each in one unit; none of a vehicle, nor before the choice."""
         self.choose(drive)
         if self._measuring is None:

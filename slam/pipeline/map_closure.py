@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
-from slam.frontend.keyframes.local_map import MapSegment, TrackedKeyframe
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join
 from slam.frontend.scale import Scale
@@ -54,7 +54,7 @@ class MapClosure:
         return replace(self.loops, accepted=tuple(accepted))
 
 
-def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
+def close_maps(maps: Sequence[LocalMap], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
     """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
 
     The ``maps`` of one drive, in time order, stay as they are, and so do their ``poses`` where no loop is found.
@@ -80,12 +80,12 @@ def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Int
 class _Rows:
     """The keyframes of all maps, row by row."""
 
-    def __init__(self, maps: Sequence[MapSegment], poses: KeyframePoses) -> None:
+    def __init__(self, maps: Sequence[LocalMap], poses: KeyframePoses) -> None:
         self.segments = maps
-        self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
-        counts = [len(segment.map.keyframes) for segment in maps]
+        self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.keyframes]
+        counts = [len(segment.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
-        self.T_map_camera = np.concatenate([segment.map.T_world_camera for segment in maps])
+        self.T_map_camera = np.concatenate([segment.T_world_camera for segment in maps])
         self.track = self._track(poses)
 
     def _track(self, poses: KeyframePoses) -> Track:
@@ -112,13 +112,13 @@ class _Rows:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
         views = []
         for segment in self.segments:
-            settled = segment.map.parallax(segment.map.keyframes).settled[:, None]
-            views += segment.map.views(np.where(settled, segment.map.points, np.nan))
+            settled = segment.parallax(segment.keyframes).settled[:, None]
+            views += segment.views(np.where(settled, segment.points, np.nan))
         return views
 
     def apart(self) -> NDArray[np.bool_]:
         """Which keyframes share few tracks ``(K, K)``."""
-        first = np.cumsum([0, *(len(segment.map.points) for segment in self.segments)])
+        first = np.cumsum([0, *(len(segment.points) for segment in self.segments)])
         tracks = [k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)]
         of_row = np.repeat(np.arange(len(tracks)), [len(of_keyframe) for of_keyframe in tracks])
         shape = len(tracks), int(first[-1])
@@ -132,7 +132,7 @@ class _Rows:
             rows = [(earlier, later) for earlier, later in map(self.of, loops) if self.maps[earlier] != number]
             joining = [self.keyframes[earlier].index for earlier, later in rows if self.maps[later] == number]
             if joining:
-                first = segment.map.keyframes[0].index
+                first = segment.keyframes[0].index
                 events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
         return tuple(events)
 
@@ -160,7 +160,7 @@ class _Rows:
         return T, scales
 
 
-def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple[list[MapSegment], list[Loop]]:
+def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple[list[LocalMap], list[Loop]]:
     """The maps after these loops, and the loops that the adjustment contradicts."""
     count, ends = len(rows.segments), rows.maps[rows.track.rows(loops)]
     links = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -180,7 +180,7 @@ def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple
 
 def _joined(
     rows: _Rows, loops: Sequence[Loop], members: NDArray[np.intp], intrinsics: Intrinsics
-) -> tuple[MapSegment, list[float]]:
+) -> tuple[LocalMap, list[float]]:
     T, scales = rows.start(loops, members)
     chosen = np.flatnonzero(np.isin(rows.maps, members))
     place = np.full(len(rows.keyframes), -1)

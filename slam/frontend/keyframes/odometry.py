@@ -36,7 +36,6 @@ from slam.frontend.keyframes.image_turn import (
 from slam.frontend.keyframes.local_map import (
     DEPTH_SIGMA,
     LocalMap,
-    MapSegment,
     NewImage,
     TrackedFrame,
     TrackedKeyframe,
@@ -102,7 +101,7 @@ class KeyframeOdometry:
         self._intrinsics = intrinsics
         self._seed = seed
         self._on_keyframe = on_keyframe
-        self.segments: list[MapSegment] = []
+        self.segments: list[LocalMap] = []
         self._places: Pixels = np.zeros((0, 2), np.float32)  # of the keyframe's corners
         self._slipped: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._T_camera_world = self._T_last_step = np.eye(4)
@@ -121,7 +120,7 @@ class KeyframeOdometry:
         last keyframe has been learned, if it has any.
         """
         self._follow(frame)
-        started = [segment.map for segment in self.segments if segment.started]
+        started = [segment for segment in self.segments if segment.started]
         # until the camera is found again in the map in which it was lost, or another map has points
         if self._relocalises and started and (self._lost > 0 or not self.segments[-1].started):
             self._relocalise(started[-1], frame)
@@ -164,7 +163,7 @@ class KeyframeOdometry:
         segment = self.segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
         if self._intrinsics.readout_s:  # how fast the camera turns, for a rolling shutter
-            last = segment.frames[-1] if segment.frames else segment.map.keyframes[-1]
+            last = segment.frames[-1] if segment.frames else segment.keyframes[-1]
             _, a, b = np.intersect1d(last.track_ids, track_ids, assume_unique=True, return_indices=True)
             self._turn_rate = measured_turn(last.pixels[a], pixels[b], since, self._turn_rate, self._intrinsics)
         if self._locate(segment, frame, track_ids, pixels):
@@ -184,17 +183,16 @@ class KeyframeOdometry:
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of the frame that was followed last, which gives points where it is a keyframe."""
         segment = self.segments[-1]
-        local = segment.map
-        if local.keyframes[-1].index != frame.index:
+        if segment.keyframes[-1].index != frame.index:
             return
-        local.keyframes[-1] = local.keyframes[-1].with_depth(depth)
-        local.add_points(self._intrinsics)
+        segment.keyframes[-1] = segment.keyframes[-1].with_depth(depth)
+        segment.add_points(self._intrinsics)
         self._spread = None
-        points = int(local.known(local.keyframes[-1].track_ids).sum())
+        points = int(segment.known(segment.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
             for before in self.segments[:-1]:  # no keyframe will be added to them
-                before.map.keyframes = [replace(keyframe, grey=None) for keyframe in before.map.keyframes]
+                before.keyframes = [replace(keyframe, grey=None) for keyframe in before.keyframes]
             self._note(frame.index, "map begun", support=points)
 
     def locates(self, first: int, last: int) -> bool:
@@ -207,13 +205,13 @@ class KeyframeOdometry:
         """A new map whose first keyframe is this frame."""
         if self._lost:
             self._note(self.segments[-1].frames[-self._lost].index, "lost")
-        self.segments.append(MapSegment())
+        self.segments.append(LocalMap())
         self._T_camera_world, self._lost = np.eye(4), 0
         self._add_keyframe(self.segments[-1], frame, *_NOTHING)
 
-    def _track(self, segment: MapSegment, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
+    def _track(self, segment: LocalMap, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a turn."""
-        keyframe = segment.map.keyframes[-1]
+        keyframe = segment.keyframes[-1]
         rows = np.flatnonzero(~self._slipped)
         if keyframe.grey is None or not len(rows):
             return _NOTHING
@@ -227,9 +225,9 @@ class KeyframeOdometry:
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]
 
-    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
+    def _locate(self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
         """The camera's pose from known points; whether there are enough."""
-        known = segment.map.known(track_ids)
+        known = segment.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
         pose = self._resected(segment, track_ids[known], pixels[known])
         if pose is None:
@@ -238,10 +236,10 @@ class KeyframeOdometry:
         before, self._T_camera_world = self._T_camera_world, pose.T_camera_world
         self._T_last_step = self._T_camera_world @ invert(before)
         slipped = track_ids[known][pose.residual_px > _SLIPPED * INLIER_PX]
-        self._slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
+        self._slipped |= np.isin(segment.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
-        last, is_young = segment.map.keyframes[-1], len(segment.map.keyframes) < _YOUNG_KEYFRAMES
+        last, is_young = segment.keyframes[-1], len(segment.keyframes) < _YOUNG_KEYFRAMES
         parallax, flow = self._moved_since(last, track_ids, pixels)
         limit = _YOUNG_PARALLAX_RATIO if is_young else _PARALLAX_RATIO
         are_few = len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS)
@@ -252,36 +250,36 @@ class KeyframeOdometry:
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
         return True
 
-    def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
+    def _resected(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
         """From the last pose and from the predicted one; None with too few inliers."""
         if len(track_ids) < MIN_POINTS:
             return None
         T_last = self._T_camera_world
         guesses = T_last, self._T_last_step @ T_last
-        points = segment.map.points[track_ids]
+        points = segment.points[track_ids]
         if self._spread is None:
-            self._spread = segment.map.spread(self._intrinsics)
-        spread = self._spread[np.searchsorted(segment.map.keyframes[-1].track_ids, track_ids)]
+            self._spread = segment.spread(self._intrinsics)
+        spread = self._spread[np.searchsorted(segment.keyframes[-1].track_ids, track_ids)]
         before = np.isin(track_ids, segment.frames[-1].track_ids) if segment.frames else np.zeros(0, np.bool_)
         trusted = before if before.sum() >= MIN_POINTS else None
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics.K, self._seed, spread, trusted)
         return pose if len(pose.inliers) >= MIN_POINTS else None
 
-    def _check_first_motion(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _check_first_motion(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> None:
         """The best motion since the last keyframe, and its points, where these had no parallax before."""
-        local, before = segment.map, segment.map.keyframes[-1]
+        before = segment.keyframes[-1]
         rows = np.searchsorted(before.track_ids, track_ids)
-        known = local.known(track_ids)
-        settled = local.parallax(local.keyframes[-_LOOKED_BACK:]).settled[track_ids]
+        known = segment.known(track_ids)
+        settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
         if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
         tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
-        depth = apply(before.T_camera_world, local.points[tracks])[:, 2]
+        depth = apply(before.T_camera_world, segment.points[tracks])[:, 2]
         T = self._T_camera_world @ invert(before.T_camera_world)
         T_now_before, depth = first_motion(T, pixels_before, now, depth, self._intrinsics, self._seed)
         self._T_camera_world = T_now_before @ before.T_camera_world
         points = self._intrinsics.rays(pixels_before) * depth[:, None]
-        local.points[tracks] = apply(invert(before.T_camera_world), points)
+        segment.points[tracks] = apply(invert(before.T_camera_world), points)
 
     def _moved_since(self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> tuple[float, float]:
         """Median parallax, and median shift, of corners ``(M, 2)`` since a keyframe, over the width of the image."""
@@ -292,29 +290,29 @@ class KeyframeOdometry:
         shift = np.linalg.norm(pixels - before, axis=1)
         return float(np.median(parallax)) / intrinsics.width, float(np.median(shift)) / intrinsics.width
 
-    def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _add_keyframe(self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""
         self._on_keyframe(frame)
-        intrinsics, local = self._intrinsics, segment.map
+        intrinsics = self._intrinsics
         T, is_tracked = self._T_camera_world, len(track_ids) > 0
         if is_tracked:
             image = NewImage(frame.grey, T, intrinsics)
-            pixels = local.aligned(image, track_ids, pixels)
-            again, reprojected = local.found_again(image, track_ids)
+            pixels = segment.aligned(image, track_ids, pixels)
+            again, reprojected = segment.found_again(image, track_ids)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, _MAX_CORNERS - len(pixels))
-        track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
+        track_ids = np.concatenate([track_ids, segment.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)
         track_ids, places = track_ids[order], pixels[order].astype(np.float64)
         unknown = np.full(len(track_ids), np.nan)
         middle, descriptors = in_middle_row(places, self._turn_rate, intrinsics), describe(frame.grey, places)
-        local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
+        segment.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
         if is_tracked:
-            gone = local.adjust(intrinsics)
-            local.keyframes[-1] = local.keyframes[-1].without(gone)
-            self._T_camera_world = local.keyframes[-1].T_camera_world
-        self._places = local.keyframes[-1].places.astype(np.float32)
+            gone = segment.adjust(intrinsics)
+            segment.keyframes[-1] = segment.keyframes[-1].without(gone)
+            self._T_camera_world = segment.keyframes[-1].T_camera_world
+        self._places = segment.keyframes[-1].places.astype(np.float32)
         self._slipped = np.zeros(len(self._places), np.bool_)
         self._spread = None
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.multiview import MIN_POINTS, resect
 from slam.geometry.robust import mad_sigma
@@ -91,7 +91,7 @@ class KeyframePoses:
 
 
 def keyframe_poses(
-    maps: Sequence[MapSegment], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
+    maps: Sequence[LocalMap], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
 ) -> KeyframePoses:
     """All relative poses of the maps of a drive; ``loops`` are keyframes of one map that see one place, by frames."""
     poses: list[RelativePose] = []
@@ -99,17 +99,17 @@ def keyframe_poses(
     segments: dict[int, int] = {}
     turns: list[RelativePose] = []
     maps = [segment for segment in maps if segment.started]
-    learned = [learned_unit(segment.map) for segment in maps]
+    learned = [learned_unit(segment) for segment in maps]
     for number, segment in enumerate(maps):
         located = _segment_poses(segment, intrinsics, seed)
         poses += located
         segments |= dict.fromkeys((frame for pose in located for frame in pose.ends), number)
         turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
-        closing |= _loop_poses(segment.map, loops, intrinsics, seed)
+        closing |= _loop_poses(segment, loops, intrinsics, seed)
     outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
     _connect(segments, outside)
     poses += [turn for turn in outside if turn.from_index in segments]
-    units = units_by_floor([segment.map for segment in maps], learned, seed)
+    units = units_by_floor(maps, learned, seed)
     return KeyframePoses(poses, segments, [closing[ends] for ends in loops], dict(enumerate(units)))
 
 
@@ -121,12 +121,12 @@ def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
                 segments.setdefault(turn.ends[new], segments[turn.ends[known]])
 
 
-def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
-    local, keyframes = segment.map, segment.map.keyframes
+def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
+    keyframes = segment.keyframes
     place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
     poses: list[RelativePose] = []
     for before, after in pairwise(keyframes):
-        seen = _seen_from(local, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed)
+        seen = _seen_from(segment, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed)
         sigmas = None if seen is None else seen[1]
         poses.append(_relative(before, after.index, after.T_camera_world, sigmas))
     T_guess = keyframes[0].T_camera_world
@@ -136,7 +136,7 @@ def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> li
             continue
         pixels = frame.pixels.astype(np.float64)
         guess = T_guess if frame.T_camera_world is None else frame.T_camera_world
-        located = _seen_from(local, frame.track_ids, pixels, guess, intrinsics, seed)
+        located = _seen_from(segment, frame.track_ids, pixels, guess, intrinsics, seed)
         if located is not None:
             T_guess, sigmas = located
             nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)

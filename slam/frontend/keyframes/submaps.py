@@ -20,7 +20,6 @@ from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
 from slam.frontend.keyframes.local_map import (
     OUTLIER_PX,
     LocalMap,
-    MapSegment,
     Parallax,
     TrackedFrame,
     TrackedKeyframe,
@@ -52,19 +51,19 @@ _LIMITS = 20, 1e-4  # iterations of an adjustment, and the relative fall of the 
 Shared = tuple[int, int, NDArray[np.intp]]
 
 
-def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
+def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
     """The parts of a map in time order; the map itself where no part has enough keyframes.
 
     Motions to keyframes and frames outside the parts, and to the next part, are ``turns`` of the part before, those
     before the first part its own.
     """
-    keyframes = segment.map.keyframes
+    keyframes = segment.keyframes
     shared = np.array([len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in pairwise(keyframes)])
     tied = shared >= MIN_POINTS
-    sigmas = _sigmas(segment.map, intrinsics)
+    sigmas = _sigmas(segment, intrinsics)
     along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
     segment = _held(segment, np.where(tied, along, _UNKNOWN))
-    local, keyframes = segment.map, segment.map.keyframes
+    keyframes = segment.keyframes
     begun, carries = np.flatnonzero(sigmas < _BEGUN), sigmas < _CARRIED
     carries[: begun[0] if len(begun) else None] = True  # before points have parallax
     number = np.concatenate([[0], np.cumsum(~(carries & tied))])
@@ -78,7 +77,7 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     runs = [rows for n in range(number[-1] + 1) if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES]
     if not runs:
         return [segment]
-    parts = [MapSegment(LocalMap([keyframes[k] for k in rows], local.points), [], True) for rows in runs]
+    parts = [LocalMap([keyframes[k] for k in rows], segment.points, [], True) for rows in runs]
     part = np.full(len(keyframes), -1)
     for n, rows in enumerate(runs):
         part[rows] = n
@@ -99,15 +98,15 @@ def parts_of(segment: MapSegment, intrinsics: Intrinsics) -> list[MapSegment]:
     return parts
 
 
-def _held(segment: MapSegment, carried: FloatArray) -> MapSegment:
+def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:
     """The map in the unit of learned depth, which holds its unit in the long run, and learned depth in the map's."""
-    units, corrections = learned_units(segment.map, carried)
-    T = segment.map.T_world_camera
+    units, corrections = learned_units(segment, carried)
+    T = segment.T_world_camera
     steps = invert(T[:-1]) @ T[1:]
     steps[:, :3, 3] *= np.sqrt(units[:-1] * units[1:])[:, None]
     held = moved(segment, chain(steps), units)
-    pairs = zip(held.map.keyframes, corrections, strict=True)
-    held.map.keyframes = [replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs]
+    pairs = zip(held.keyframes, corrections, strict=True)
+    held.keyframes = [replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs]
     return held
 
 
@@ -145,12 +144,12 @@ def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
 
 
 def join(
-    segments: Sequence[MapSegment],
+    segments: Sequence[LocalMap],
     T_world_camera: FloatArray,
     scales: FloatArray,
     shared: Sequence[Shared],
     intrinsics: Intrinsics,
-) -> tuple[MapSegment, list[float]]:
+) -> tuple[LocalMap, list[float]]:
     """One map of several, or of one with loops; the segments stay as they are.
 
     Args:
@@ -163,65 +162,64 @@ def join(
     Returns:
         The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
     """
-    ends = np.cumsum([len(segment.map.keyframes) for segment in segments])[:-1]
+    ends = np.cumsum([len(segment.keyframes) for segment in segments])[:-1]
     parts = zip(segments, np.split(T_world_camera, ends), np.split(scales, ends), strict=True)
     united = _united([moved(*part) for part in parts])
-    keyframes = united.map.keyframes
-    tracks = _merged_tracks(keyframes, len(united.map.points), shared)
+    keyframes = united.keyframes
+    tracks = _merged_tracks(keyframes, len(united.points), shared)
     joined = _renumbered(united, tracks)
     everything = range(len(keyframes))
     for limit in _OUTLIER_LIMITS:
-        sightings, track_ids = joined.map.sightings(everything, np.isfinite(joined.map.points[:, 0]), intrinsics)
-        gone, _ = joined.map.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
+        sightings, track_ids = joined.sightings(everything, np.isfinite(joined.points[:, 0]), intrinsics)
+        gone, _ = joined.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
         outliers = sum(map(len, gone))
         logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)
     kept_ratios = []
     for earlier, later, corners in shared:
         seen = [
-            np.isin(tracks[keyframes[row].track_ids[rows]], joined.map.keyframes[row].track_ids)
+            np.isin(tracks[keyframes[row].track_ids[rows]], joined.keyframes[row].track_ids)
             for row, rows in zip((earlier, later), corners.T, strict=True)
         ]
         kept_ratios.append(float(np.mean(seen[0] & seen[1])))
     return joined, kept_ratios
 
 
-def moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -> MapSegment:
+def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> LocalMap:
     """A map by new poses ``(K, 4, 4)`` and units ``(K,)`` of its keyframes.
 
     Points follow the first keyframe that sees them, frames the last keyframe before them.
     """
-    before = segment.map
-    points = np.full_like(before.points, np.nan)
-    for keyframe, T, scale in reversed(list(zip(before.keyframes, T_world_camera, scales, strict=True))):
-        points_camera = apply(keyframe.T_camera_world, before.points[keyframe.track_ids])
+    points = np.full_like(segment.points, np.nan)
+    for keyframe, T, scale in reversed(list(zip(segment.keyframes, T_world_camera, scales, strict=True))):
+        points_camera = apply(keyframe.T_camera_world, segment.points[keyframe.track_ids])
         points[keyframe.track_ids] = apply(T, scale * points_camera)
     T_camera_world = invert(T_world_camera)
-    keyframes = [replace(k, T_camera_world=T) for k, T in zip(before.keyframes, T_camera_world, strict=True)]
+    keyframes = [replace(k, T_camera_world=T) for k, T in zip(segment.keyframes, T_camera_world, strict=True)]
     indices = np.array([keyframe.index for keyframe in keyframes])
     frames = []
     for frame in segment.frames:
         row = max(int(np.searchsorted(indices, frame.index, side="right")) - 1, 0)
         T_followed = None
         if frame.T_camera_world is not None:
-            T_frame_keyframe = frame.T_camera_world @ invert(before.keyframes[row].T_camera_world)
+            T_frame_keyframe = frame.T_camera_world @ invert(segment.keyframes[row].T_camera_world)
             T_frame_keyframe[:3, 3] *= scales[row]
             T_followed = T_frame_keyframe @ T_camera_world[row]
         frames.append(replace(frame, T_camera_world=T_followed))
-    return MapSegment(LocalMap(keyframes, points), frames, segment.started, segment.turns)
+    return LocalMap(keyframes, points, frames, segment.started, segment.turns)
 
 
-def _united(segments: Sequence[MapSegment]) -> MapSegment:
+def _united(segments: Sequence[LocalMap]) -> LocalMap:
     """The maps in one, with tracks numbered one map after the other."""
     keyframes: list[TrackedKeyframe] = []
     frames: list[TrackedFrame] = []
     first = 0
     for segment in segments:
-        keyframes += [replace(keyframe, track_ids=keyframe.track_ids + first) for keyframe in segment.map.keyframes]
+        keyframes += [replace(keyframe, track_ids=keyframe.track_ids + first) for keyframe in segment.keyframes]
         frames += [replace(frame, track_ids=frame.track_ids + first) for frame in segment.frames]
-        first += len(segment.map.points)
-    points = np.concatenate([segment.map.points for segment in segments])
+        first += len(segment.points)
+    points = np.concatenate([segment.points for segment in segments])
     turns = [turn for segment in segments for turn in segment.turns]
-    return MapSegment(LocalMap(keyframes, points), frames, True, turns)
+    return LocalMap(keyframes, points, frames, True, turns)
 
 
 def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[Shared]) -> TrackIds:
@@ -245,13 +243,13 @@ def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Seq
     return first
 
 
-def _renumbered(segment: MapSegment, tracks: TrackIds) -> MapSegment:
+def _renumbered(segment: LocalMap, tracks: TrackIds) -> LocalMap:
     keyframes = []
-    for keyframe in segment.map.keyframes:
+    for keyframe in segment.keyframes:
         merged = tracks[keyframe.track_ids]
         keyframes.append(keyframe.with_corners(np.argsort(merged), merged))
-    points = segment.map.points.copy()
+    points = segment.points.copy()
     lonely = np.flatnonzero(np.isnan(points[tracks, 0]) & np.isfinite(points[:, 0]))
     points[tracks[lonely]] = points[lonely]
     frames = [replace(frame, track_ids=tracks[frame.track_ids]) for frame in segment.frames]
-    return MapSegment(LocalMap(keyframes, points), frames, True, segment.turns)
+    return LocalMap(keyframes, points, frames, True, segment.turns)

@@ -104,7 +104,7 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
             if k in interrupted:
                 observer.measured()
         drive = completed(observer)
-    keyframes = drive.maps[-1].map.keyframes
+    keyframes = drive.maps[-1].keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
     assert [k for k in predicted if k >= 20] == [keyframe.index for keyframe in keyframes if keyframe.index >= 20]
     assert [snippet.target for snippet in drive.trusted if snippet.target > 18] == [22, 26, 30, 34]

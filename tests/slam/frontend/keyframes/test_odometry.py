@@ -27,7 +27,7 @@ def test_a_hand_held_camera_is_followed() -> None:
     T = chained(found.poses)
     assert sorted(T) == list(range(70))
     assert {pose.source for pose in found.poses} == {KEYFRAME_SOURCE}
-    assert 4 <= len(state.segments[0].map.keyframes) <= 30
+    assert 4 <= len(state.segments[0].keyframes) <= 30
     estimate = np.stack([T[k] for k in range(70)])
     similarity = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True)
     error = np.linalg.norm(similarity.apply_to_poses(estimate)[:, :3, 3] - truth[:, :3, 3], axis=1)
@@ -66,7 +66,7 @@ def test_without_parallax_the_camera_has_its_turn_and_stays(motion: str) -> None
 def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
     walked = room.walk(30)
     state = room.tracked(np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
-    keyframes = state.segments[0].map.keyframes
+    keyframes = state.segments[0].keyframes
     assert keyframes[-1].index <= 31
     T = chained(poses(state).poses)
     stood = np.linalg.norm(np.stack([T[k][:3, 3] - T[32][:3, 3] for k in range(32, 55)]), axis=1)
@@ -82,7 +82,7 @@ def test_another_scene_begins_another_map() -> None:
     assert len(set(found.segments.values())) == 2
     assert max(frame for frame, number in found.segments.items() if number == 0) < 25
     assert not any(pose.from_index < 25 <= pose.to_index for pose in found.poses)
-    images = [[keyframe.grey is not None for keyframe in segment.map.keyframes] for segment in state.segments]
+    images = [[keyframe.grey is not None for keyframe in segment.keyframes] for segment in state.segments]
     assert not any(images[0]) and any(images[1])
 
 

@@ -354,7 +354,24 @@ class GroundPlaneFitter:
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
         self._seed = seed
-        self._rows, self._columns, self._rays = _trapezoid(intrinsics)
+        # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a level camera)
+        horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
+        top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
+        area = intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
+        step = max(1.0, float(np.sqrt(max(area, 1.0) / _PLANE_POINTS)))
+        rows_seen = np.unique(np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64))
+        rows, columns = [], []
+        for row in rows_seen:
+            share = (row - top_row) / (bottom_row - top_row)
+            width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
+            half = width * intrinsics.width / 2
+            across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
+            across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
+            columns.append(across)
+            rows.append(np.full(len(across), row))
+        empty = [np.empty(0, dtype=np.int64)]
+        v, u = np.concatenate(rows or empty), np.concatenate(columns or empty)
+        self._rows, self._columns, self._rays = v, u, intrinsics.rays(np.stack([u, v], axis=-1))
 
     def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | Failed:
         """The camera's unscaled height over the plane of learned z-depth ``(H, W)`` without the bias by its ``error``.
@@ -378,30 +395,6 @@ class GroundPlaneFitter:
         if inlier_ratio < _MIN_INLIER_RATIO:
             return Failed(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
         return height
-
-
-def _trapezoid(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Rows, columns ``(P,)`` and rays ``(P, 3)`` of about ``_PLANE_POINTS`` pixels.
-
-    The horizon is taken at cy (a level camera).
-    """
-    horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
-    top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
-    area = intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
-    step = max(1.0, float(np.sqrt(max(area, 1.0) / _PLANE_POINTS)))
-    rows_seen = np.unique(np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64))
-    rows, columns = [], []
-    for row in rows_seen:
-        share = (row - top_row) / (bottom_row - top_row)
-        width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
-        half = width * intrinsics.width / 2
-        across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
-        across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
-        columns.append(across)
-        rows.append(np.full(len(across), row))
-    empty = [np.empty(0, dtype=np.int64)]
-    v, u = np.concatenate(rows or empty), np.concatenate(columns or empty)
-    return v, u, intrinsics.rays(np.stack([u, v], axis=-1))
 
 
 def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArray | None:

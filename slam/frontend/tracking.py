@@ -254,7 +254,12 @@ def _tracked(
     flows = [predicted_flow, None] if predicted_flow else [None]
     pixels, kept = _by_first_flow(first, second, points, flows)
     if kept.sum() < FEW_CORNERS:
-        exposed = _histogram_matched(second, first)
+        # the second image with its histogram matched to that of the first
+        ranks_first, ranks = (
+            np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (first, second)
+        )
+        levels = np.interp(ranks, ranks_first, np.arange(256.0))
+        exposed = np.asarray(cv2.LUT(second, np.rint(levels).astype(np.uint8)))
         pixels_wide, kept_wide = _by_first_flow(first, exposed, points, flows, _WIDE_WINDOW_PX)
         if kept_wide.sum() > kept.sum():
             return pixels_wide, kept_wide
@@ -274,13 +279,6 @@ def _by_first_flow(
         moved = moved[found_back]
         pixels[tried[found_back]], kept[tried[found_back]] = moved if flow is None else flow.in_current(moved), True
     return pixels, kept & are_inside(pixels, second.shape)
-
-
-def _histogram_matched(grey: Grey, other: Grey) -> Grey:
-    """An image ``(H, W)`` with its histogram matched to that of another."""
-    ranks, ranks_other = (np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (grey, other))
-    levels = np.interp(ranks, ranks_other, np.arange(256.0))
-    return np.asarray(cv2.LUT(grey, np.rint(levels).astype(np.uint8)))
 
 
 @dataclass(frozen=True, eq=False)

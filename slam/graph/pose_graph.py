@@ -67,8 +67,15 @@ class PoseGraph:
         Raises:
             SlamError: if one is not a rigid transform, links a frame to itself or has no positive sigmas.
         """
-        for relative_pose in relative_poses:
-            _check(relative_pose)
+        for edge in relative_poses:
+            name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
+            if edge.from_index == edge.to_index or min(edge.from_index, edge.to_index) < 0:
+                raise SlamError(f"{name} must link two different frames")
+            if not is_se3(edge.T_from_to):
+                raise SlamError(f"{name} is not a finite rigid transform")
+            for sigmas in (edge.sigmas, edge.graph_sigmas):
+                if sigmas.shape != (6,) or not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
+                    raise SlamError(f"{name} needs six positive sigmas; got {sigmas}")
         self.relative_poses += relative_poses
 
     def add_positions(
@@ -219,17 +226,6 @@ def robust_noise(sigmas: FloatArray) -> Any:
     """GTSAM's model of independent errors with these sigmas and Huber's loss."""
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
-
-
-def _check(edge: RelativePose) -> None:
-    name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
-    if edge.from_index == edge.to_index or min(edge.from_index, edge.to_index) < 0:
-        raise SlamError(f"{name} must link two different frames")
-    if not is_se3(edge.T_from_to):
-        raise SlamError(f"{name} is not a finite rigid transform")
-    for sigmas in (edge.sigmas, edge.graph_sigmas):
-        if sigmas.shape != (6,) or not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
-            raise SlamError(f"{name} needs six positive sigmas; got {sigmas}")
 
 
 def _pose3(T_a_b: FloatArray) -> Any:

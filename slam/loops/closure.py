@@ -144,7 +144,10 @@ def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
-    return [loop.widened(float(np.sqrt(count))) for loop, count in zip(loops, alike, strict=True)]
+    return [
+        replace(loop, measured=replace(loop.measured, sigmas=float(np.sqrt(count)) * loop.measured.sigmas))
+        for loop, count in zip(loops, alike, strict=True)
+    ]
 
 
 class Candidate(NamedTuple):

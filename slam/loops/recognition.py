@@ -15,7 +15,7 @@ ratios, degrees, and lengths over the depth of the points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import cv2
@@ -269,10 +269,6 @@ class Loop:
     def ends(self) -> tuple[int, int]:
         """Earlier and later frame."""
         return self.measured.from_index, self.measured.to_index
-
-    def widened(self, factor: float) -> Loop:
-        """The same loop with larger sigmas."""
-        return replace(self, measured=replace(self.measured, sigmas=factor * self.measured.sigmas))
 
     def refused(self, reason: str) -> RejectedLoop:
         """The same loop, rejected for a reason."""

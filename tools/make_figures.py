@@ -26,9 +26,8 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
-from slam.results.report.figures import LOOKS
-from slam.results.report.map_view import MapMesh, thinned_mesh
-from slam.results.report.pictures import narrowed
+from slam.results.report.figures import LOOKS, MapMesh, thinned_mesh
+from slam.results.report.page import narrowed
 from slam.runtime.files import MAP_MESH, REFERENCE, TRAJECTORIES
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import open_sequence

@@ -37,8 +37,7 @@ from slam.frontend.agreement import CONFIDENCE, share_right
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
-from slam.sequences.catalogue import open_sequence
-from slam.sequences.simulated import SimulatedSequence
+from slam.sequences.catalogue import SimulatedSequence, open_sequence
 from slam.simulation.hazards import Hazard
 from slam.simulation.kitti_layout import write_image, write_lines
 from slam.simulation.options import SimulationOptions

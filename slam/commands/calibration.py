@@ -24,9 +24,8 @@ from slam.frames import Grey
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SlamError, sequence_errors
 from slam.runtime.files import write_atomically
-from slam.sequences.camera_file import DEFAULT_FPS
+from slam.sequences.camera_file import DEFAULT_FPS, Undistortion
 from slam.sequences.images import ImageFiles, ImageSource
-from slam.sequences.undistortion import Undistortion
 
 Pattern = Literal["chessboard", "charuco"]
 Model = Literal["opencv", "fisheye"]

@@ -17,17 +17,8 @@ from erfsfm.common.table import Table, csv_of
 from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, evo_commands, exceeded, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
+from slam.results import tables
 from slam.results.folder import RunFolder, check_replaced
-from slam.results.tables import (
-    COLUMNS,
-    UNITS,
-    ErrorColumn,
-    alignments_table,
-    missing_notes,
-    runs_json,
-    runs_table,
-    written,
-)
 from slam.runtime.errors import RunError, SlamError, TrajectoryError
 from slam.runtime.files import REFERENCE, trajectory_file, write_atomically
 from slam.sequences.recording import frame_range
@@ -53,8 +44,8 @@ def against_reference(
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:
-        notes = [UNITS, *missing_notes({run.system: run.errors for run in runs})]
-        head = ["system", "poses", *(column.name for column in COLUMNS)]
+        notes = [tables.UNITS, *tables.missing_notes({run.system: run.errors for run in runs})]
+        head = ["system", "poses", *(column.name for column in tables.COLUMNS)]
         Table(head, list(_rows(runs)), f"Errors against {reference}", notes).print()
     if broken := [f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)]:
         raise SlamError("; ".join(broken))
@@ -64,9 +55,9 @@ def of_runs(paths: Sequence[Path], as_json: bool) -> None:
     """Run folders side by side."""
     runs = [(folder.path, folder.metrics()) for folder in map(RunFolder.open, paths)]
     if as_json:
-        typer.echo(json.dumps(runs_json(runs), indent=2))
+        typer.echo(json.dumps(tables.runs_json(runs), indent=2))
     else:
-        runs_table(runs).print()
+        tables.runs_table(runs).print()
 
 
 def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool) -> None:
@@ -79,7 +70,7 @@ def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], 
     if as_json:
         typer.echo(run.errors.to_json())
     else:
-        alignments_table(run.errors, f"{estimate.name} against {reference.name}").print()
+        tables.alignments_table(run.errors, f"{estimate.name} against {reference.name}").print()
         both = {estimate: "optimised", reference: REFERENCE}
         timed = all(trajectory_at(path, format, name).timed for path, name in both.items())
         kind = "tum" if timed else "kitti"
@@ -171,16 +162,16 @@ def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
         own = [run for run in runs if run.system == system]
         poses = "/".join(map(str, sorted({run.poses for run in own})))
         name = f"{system} ({len(own)} runs)" if len(own) > 1 else system
-        yield [name, poses, *(_spread(column, own) for column in COLUMNS)]
+        yield [name, poses, *(_spread(column, own) for column in tables.COLUMNS)]
 
 
-def _spread(column: ErrorColumn, runs: Sequence[SystemRun]) -> str:
+def _spread(column: tables.ErrorColumn, runs: Sequence[SystemRun]) -> str:
     """The number of one run; of several the mean and the deviation of those that have it."""
     values = [value for value in (run.errors.at(column.path)[0] for run in runs) if value is not None]
     if len(values) < 2:
-        return written(values[0] if values else None, column.decimals)
+        return tables.written(values[0] if values else None, column.decimals)
     mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))
-    return f"{written(mean, column.decimals)} ± {written(deviation, column.decimals)}"
+    return f"{tables.written(mean, column.decimals)} ± {tables.written(deviation, column.decimals)}"
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -27,10 +27,9 @@ from slam.loops.recognition import OF_FRAMES, OF_KEYFRAMES, FeatureExtractor, Pl
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
-from slam.sequences.camera_file import beside, explicit_camera
+from slam.sequences.camera_file import beside, explicit_camera, undistorted
 from slam.sequences.images import ImageFiles
 from slam.sequences.recording import frame_range
-from slam.sequences.undistortion import undistorted
 
 _PLACES_TRIED = 8
 _STARTS = 3  # of these are refined

@@ -31,16 +31,13 @@ from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.prediction.assembly import Prediction, open_prediction
-from slam.prediction.depth_folder import FrameNumbers
-from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
-from slam.results.folder import RunFolder, check_output
+from slam.prediction.depth_source import FrameNumbers
+from slam.results.estimate_metrics import DepthQuality, estimate_metrics, lidar_trajectory, map_errors, timing_of
+from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
-from slam.results.report.map_view import map_view
-from slam.results.report.page import Picture, write_report
-from slam.results.report.pictures import DepthPictures, loop_pictures
+from slam.results.report.figures import map_view
+from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
 from slam.results.report.rerun import write_rerun
-from slam.results.run_log import RunLog, run_log
-from slam.results.truth import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
 from slam.runtime.files import (
     CONFIG,
@@ -55,7 +52,7 @@ from slam.runtime.files import (
 )
 from slam.runtime.imports import import_extra
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.gps import read_gps
+from slam.sequences.poses import read_gps
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from slam.runtime.errors import Failed
-from slam.runtime.storage.record import Count, Record
+from slam.runtime.record import Count, Record
 
 LEAST_M, LARGEST_M = 1.0, 80.0
 COVERAGES = (50, 90, 95)

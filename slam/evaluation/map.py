@@ -22,7 +22,7 @@ from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
 from slam.mapping.views import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
-from slam.runtime.storage.record import Count, Record, part
+from slam.runtime.record import Count, Record, part
 from slam.simulation.surface import scene_of
 
 NEAR_CAMERA_M = 20.0

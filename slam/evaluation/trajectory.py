@@ -23,7 +23,7 @@ from slam.formats.trajectory import Trajectory, associate, matching_tolerance_s,
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import ConfigError, Failed, TrajectoryError
-from slam.runtime.storage.record import Count, Record, part
+from slam.runtime.record import Count, Record, part
 
 Alignment = Literal["none", "first", "scale", "6dof", "7dof"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)

@@ -1,1 +1,1 @@
-"""Files of other programs: g2o, COLMAP, PLY, poses; what cannot be written is a ``SlamError`` of one line."""
+"""Files of other programs: COLMAP, PLY, poses; what cannot be written is a ``SlamError`` of one line."""

@@ -13,8 +13,8 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import RunError
@@ -30,6 +30,7 @@ MODEL_FILES = tuple(_HEADERS)
 BINARY_FOLDER = "sparse"
 _PINHOLE = 1
 _HALF_PIXEL = 0.5
+_QUATERNION_WXYZ_FIRST = [6, 3, 4, 5, 0, 1, 2]  # of a translation and a quaternion xyzw
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,7 @@ def _images(
     of_frames: dict[int, NDArray[np.intp]],
 ) -> tuple[list[str], list[bytes]]:
     """Two lines an image, the second of its corners, and the same in binary form."""
-    T_camera_world = invert(T_world_camera)
-    quaternions_xyzw = Rotation.from_matrix(T_camera_world[:, :3, :3]).as_quat(canonical=True)
-    poses = np.concatenate([quaternions_xyzw[:, [3, 0, 1, 2]], T_camera_world[:, :3, 3]], axis=1)
+    poses = translations_and_quaternions(invert(T_world_camera))[:, _QUATERNION_WXYZ_FIRST]
     lines, parts = [], []
     for k, pose in enumerate(poses.tolist()):
         if k in without_image:

@@ -53,8 +53,6 @@ class Ply:
 def read_ply(path: Path) -> Ply:
     """Read a whole file: every vertex, every triangle, and nothing after them.
 
-    ``RunError``: it is no PLY in little-endian form, is cut short, or holds impossible values.
-
     Raises:
         RunError: it is no PLY in little-endian form, is cut short, or holds impossible values.
     """

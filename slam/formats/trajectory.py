@@ -1,12 +1,15 @@
 """Trajectories: camera poses with time stamps, their KITTI and TUM files, and association by time stamp.
 
-Conventions: ``docs/design/conventions.md``. Quaternions are those of TUM files.
+Conventions: ``docs/design/conventions.md``. Quaternions are those of TUM files. A bad row of a table that somebody else
+wrote, of this or another kind, is left out and said, and does not cost the recording.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.formats.rows import BadRows, in_seconds, is_number, rows_of
+from erfsfm.common.files import read_text
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import TrajectoryError
+from slam.runtime.errors import SlamError, TrajectoryError
 from slam.runtime.files import write_atomically
 
 logger = logging.getLogger(__name__)
@@ -36,6 +39,10 @@ _UNITS = {1: "milliseconds", 2: "microseconds", 3: "nanoseconds"}  # by powers o
 _UNIT_TOLERANCE = 0.2  # of such a power: one of the two covers a quarter at least
 _LEAST_OF_OTHER_UNIT = 10  # matching rows, which are by chance
 _LONE_PERIOD_S = 0.04  # of a trajectory of one pose
+_LEAST_IN_ORDER = 0.75  # share of the rows; with fewer, nobody knows which of them are out of order
+_MOST_PLACES_LATE = 5
+_FRACTIONS = {13: 3, 16: 6}  # digits of milli- and microseconds since 1970, and how many are behind the point
+_NANOSECOND_DIGITS = 15  # at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +117,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     of 7 numbers are TartanVO's: position and quaternion of a camera that looks along x, with z down. EuRoC's columns
     are separated by commas: nanoseconds, position, quaternion w x y z and others. Commas or semicolons may separate
     the columns of all. Stamps are seconds, or whole milli-, micro- or nanoseconds. A header, blank lines and those that
-    start with ``#`` are skipped; bad rows are left out (`slam.formats.rows`), and where rows have no stamps the others
+    start with ``#`` are skipped; bad rows are left out (`BadRows`), and where rows have no stamps the others
     keep their numbers. Rotations that are not orthonormal by rounding are replaced by the nearest rotation.
 
     Raises:
@@ -161,11 +168,16 @@ def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps are written with all their digits."""
-    quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
-    poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
+    poses = translations_and_quaternions(trajectory.T_world_camera)
     stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
     lines = (f"{stamp} {_row(pose)}\n" for stamp, pose in zip(stamps, poses))
     write_atomically(Path(path), "".join(["# timestamp tx ty tz qx qy qz qw\n", *lines]), TrajectoryError)
+
+
+def translations_and_quaternions(T_a_b: FloatArray) -> FloatArray:
+    """Translation and quaternion (xyzw) ``(N, 7)`` of poses ``(N, 4, 4)``."""
+    quaternions_xyzw = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat(canonical=True)
+    return np.concatenate([T_a_b[:, :3, 3], quaternions_xyzw], axis=1)
 
 
 def associate(
@@ -178,7 +190,6 @@ def associate(
     numbers where one of the two has them, and else row k belongs to row k.
 
     Of ``frames`` only these rows [start, stop) of the reference count; an estimate of as many rows is of these frames.
-    ``TrajectoryError``: the lengths differ and stamps or frame numbers are missing, or none match.
 
     Raises:
         TrajectoryError: if the lengths differ and stamps or frame numbers are missing, or none match.
@@ -274,8 +285,7 @@ def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.int
     if len(candidates) == 1:
         return np.zeros(len(stamps), dtype=np.intp)
     before_is_nearer = stamps - candidates[after - 1] <= candidates[after] - stamps
-    nearest: NDArray[np.intp] = np.where(before_is_nearer, after - 1, after)
-    return nearest
+    return np.asarray(np.where(before_is_nearer, after - 1, after))
 
 
 def _read_numbers(
@@ -324,3 +334,105 @@ def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:
 
 def _row(values: FloatArray) -> str:
     return " ".join(f"{value:.9e}" for value in values)
+
+
+class BadRows:
+    """The rows of one file that are left out, with a reason each, and the rule for all tables.
+
+    A row that cannot be read, or whose stamp repeats another's or is far from its place, is left out. One warning
+    counts them and names the first. The file is refused where nothing is left, or where the order is ambiguous.
+    """
+
+    def __init__(self, path: Path | str, error: type[SlamError]) -> None:
+        """Of a file at ``path``, which ``error`` refuses."""
+        self._path, self._error = path, error
+        self._reasons: dict[int, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._reasons)
+
+    def add(self, line: int, reason: str) -> None:
+        """Leave out the row on this line."""
+        self._reasons.setdefault(line, reason)
+
+    def without(self, checks: Sequence[tuple[Any, str]], lines: NDArray[np.intp], *columns: Any) -> tuple[Any, ...]:
+        """Lines ``(N,)`` and columns ``(N, ...)`` of the rows that pass all checks ``(N,)``; others have the reason."""
+        for is_good, reason in checks:
+            for line in lines[~is_good].tolist():
+                self.add(line, reason)
+        are_good = np.all([is_good for is_good, _ in checks], axis=0)
+        return tuple(column[are_good] for column in (lines, *columns))
+
+    def in_order(
+        self, stamps: NDArray[np.float64], what: str, lines: NDArray[np.intp], wanted: str
+    ) -> NDArray[np.intp]:
+        """The rows in the order of their stamps ``(N,)``, without repeated ones and those far from their place.
+
+        A row a few places late is sorted in, and so are all rows of a table in no order at all. Bad rows are said. A
+        file of which more than a quarter would be left out is refused, and so is one without a ``wanted`` row (`say`).
+        """
+        order = np.argsort(stamps, kind="stable")
+        has_no_order = len(order) > 1 and np.mean(np.diff(stamps) < 0) > 1 - _LEAST_IN_ORDER
+        bad = np.abs(order - np.arange(len(order))) > (len(order) if has_no_order else _MOST_PLACES_LATE)
+        bad[1:] |= np.diff(stamps[order]) == 0
+        for line in lines[order[bad]].tolist():
+            self.add(line, f"{what} must increase")
+        if bad.sum() > (1 - _LEAST_IN_ORDER) * len(bad):
+            line = int(lines[order[bad]].min())
+            raise self._error(f"{self._path}, line {line}: {what} must increase; sort the rows, a series a file")
+        good = order[~bad]
+        self.say(len(good), wanted)
+        late = np.flatnonzero(np.diff(good) < 0)
+        if len(late):
+            line = int(lines[good[late + 1]].min())
+            logger.warning("%s: %s are not in order, first on line %d: the rows are sorted", self._path, what, line)
+        return good
+
+    def say(self, left: int, wanted: str) -> None:
+        """Warn of the rows left out; refuse the file where none of those ``wanted`` is ``left``."""
+        line, reason = min(self._reasons.items(), default=(0, ""))
+        if not left:
+            where = f", line {line}: {reason}" if reason else ": there is no row in this file"
+            raise self._error(f"{self._path}{where}; wanted {wanted}")
+        if self._reasons:
+            total = left + len(self._reasons)
+            logger.warning(
+                "%s: %d of %d rows are left out; line %d: %s", self._path, len(self._reasons), total, line, reason
+            )
+
+
+def text_of(path: Path, error: type[SlamError], wanted: str) -> str:
+    """The text of a file that should hold what is ``wanted``; the ``error`` where it cannot be read."""
+    try:
+        return read_text(path)
+    except FileNotFoundError as cause:
+        raise error(f"{path}: no such file; wanted {wanted}") from cause
+    except (OSError, UnicodeDecodeError) as cause:
+        reason = getattr(cause, "strerror", None) or "this is not a text file (UTF-8)"
+        raise error(f"{path}: {reason}; wanted {wanted}") from cause
+
+
+def rows_of(path: Path, error: type[SlamError], wanted: str) -> list[tuple[int, str]]:
+    """Line numbers and texts of the rows of a table, without blank lines and comments; as `text_of`."""
+    lines = enumerate(map(str.strip, text_of(path, error, wanted).splitlines()), start=1)
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
+
+
+def is_number(word: str) -> bool:
+    """Whether Python reads a number, without its underscores."""
+    try:
+        return "_" not in word and float(word) is not None
+    except ValueError:
+        return False
+
+
+def number_or_nan(word: str) -> float:
+    """A number; NaN where the word is none."""
+    return float(word) if is_number(word) else math.nan
+
+
+def in_seconds(word: str) -> str:
+    """A stamp as a number of seconds; whole milli- and microseconds since 1970 and nanoseconds have their point set."""
+    word = word.strip()
+    places = _FRACTIONS.get(len(word), 9 if len(word) >= _NANOSECOND_DIGITS else 0)
+    return f"{word[:-places]}.{word[-places:]}" if places and word.isdecimal() else word

@@ -23,10 +23,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from slam.formats.g2o import write_g2o
+from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry.se3 import FloatArray, invert, is_se3, make
 from slam.runtime.errors import SlamError
+from slam.runtime.files import write_atomically
 
 _ANCHOR_SIGMA = 1e-6
 _LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
@@ -36,6 +37,10 @@ _LARGEST_LOOP_RESIDUAL, _OUTLYING = 8.0, 3.0
 _MAX_ITERATIONS = 100  # of Levenberg-Marquardt
 _MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
 _RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
+# g2o's text format
+_TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
+_UPPER = np.triu_indices(6)  # row by row
+_VERTEX, _EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 
 logger = logging.getLogger(__name__)
 
@@ -156,7 +161,14 @@ class PoseGraph:
 
     def write_g2o(self, path: Path) -> None:
         """Write the optimised graph in g2o's text format at full precision, atomically."""
-        write_g2o(path, self.relative_poses, self._solution())
+        T_from_to = np.array([edge.T_from_to for edge in self.relative_poses]).reshape(-1, 4, 4)
+        lines = [
+            f"{_VERTEX} {k} {_numbers(pose)}" for k, pose in enumerate(translations_and_quaternions(self._solution()))
+        ]
+        for edge, pose in zip(self.relative_poses, translations_and_quaternions(T_from_to), strict=True):
+            information = np.diag(1.0 / edge.graph_sigmas[_TRANSLATION_FIRST] ** 2)[_UPPER]
+            lines.append(f"{_EDGE} {edge.from_index} {edge.to_index} {_numbers(pose)} {_numbers(information)}")
+        write_atomically(path, "\n".join([*lines, ""]))
 
     def _solution(self) -> FloatArray:
         if self._T_world_camera is None:
@@ -286,3 +298,8 @@ def optimise_similarities(
 
 def _similarity(T_a_b: FloatArray, scale: float) -> Any:
     return gtsam.Similarity3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3] / scale, scale)
+
+
+def _numbers(row: FloatArray) -> str:
+    """With the shortest digits of an exact round trip."""
+    return " ".join(map(repr, row.tolist()))

@@ -19,7 +19,7 @@ from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, Submap
 from slam.mapping.surface import MapSurface
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.storage.spill import SpillFile
+from slam.runtime.resources import SpillFile
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slam.frames import DepthMap, Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.imports import import_open3d
-from slam.runtime.storage.spill import SpilledArray, SpillFile
+from slam.runtime.resources import SpilledArray, SpillFile
 
 BLOCK_SIDE = 16
 BLOCK_VOXELS = BLOCK_SIDE**3

@@ -24,7 +24,7 @@ from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, MergedSubmaps, SpilledS
 from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile, with_holes_closed
 from slam.mapping.views import Painter
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.storage.spill import SpilledArray, SpillFile
+from slam.runtime.resources import SpilledArray, SpillFile
 
 _LEAST_WEIGHT = 1.0  # observations of a voxel that becomes surface
 _LEAST_TRIANGLES = 300  # of a connected piece; smaller ones float

@@ -20,7 +20,7 @@ from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import Failed
-from slam.runtime.timing import Stopwatch
+from slam.runtime.resources import Stopwatch
 
 
 @dataclass(frozen=True)

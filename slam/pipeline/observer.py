@@ -25,8 +25,7 @@ from slam.geometry.se3 import chain, is_se3
 from slam.loops.recognition import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
-from slam.runtime.storage.spill import SpillFile
-from slam.runtime.timing import Stopwatch, return_freed_memory
+from slam.runtime.resources import SpillFile, Stopwatch, return_freed_memory
 
 logger = logging.getLogger(__name__)
 

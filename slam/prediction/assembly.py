@@ -11,9 +11,7 @@ from typing import Any
 from erfsfm.inference import DepthPosePredictor, depth_at, limit_torch_threads
 from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
-from slam.prediction.depth_folder import DepthFolder, FrameNumbers, Undistort
-from slam.prediction.depth_source import DepthSource, SourcedPredictor
-from slam.prediction.onnx_depth import OnnxDepth
+from slam.prediction.depth_source import DepthFolder, DepthSource, FrameNumbers, OnnxDepth, SourcedPredictor, Undistort
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_plug_in, plug_ins
 

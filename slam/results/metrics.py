@@ -10,7 +10,7 @@ from slam.config.sections import ScaleMode
 from slam.evaluation.depth import DepthMetrics
 from slam.evaluation.map import PlacedMetrics
 from slam.evaluation.trajectory import TrajectoryMetrics
-from slam.runtime.storage.record import Count, Record, part
+from slam.runtime.record import Count, Record, part
 
 METRES = "metres"
 CAMERA_HEIGHTS = "camera heights"

@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
+from slam.formats.trajectory import BadRows, in_seconds, number_or_nan, rows_of
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
-from slam.sequences.gps import FASTEST_M_S
+from slam.sequences.camera_file import Undistortion, require_size, undistorted
 from slam.sequences.images import ImageFiles, ImageSource, ReadImages, too_long
-from slam.sequences.poses import known_poses, rebased
-from slam.sequences.undistortion import Undistortion, require_size, undistorted
+from slam.sequences.poses import FASTEST_M_S, known_poses, rebased
 
 logger = logging.getLogger(__name__)
 
@@ -249,7 +248,7 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
 def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> FloatArray:
     """Stamps in seconds read from a file, one for each row of the numbered files it belongs to ``(len(files),)``.
 
-    Bad ones are interpolated between their neighbours (`slam.formats.rows`).
+    Bad ones are interpolated between their neighbours (`BadRows`).
 
     Args:
         stamps: one for each number from 0, one for each row, or one for each file; then those of missing files are
@@ -267,8 +266,7 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
     rows, skipped = assigned
     if len(rows) == len(files):
         return stamps[skipped:]
-    spread: FloatArray = np.interp(np.arange(len(files)), rows, stamps)
-    return spread
+    return np.asarray(np.interp(np.arange(len(files)), rows, stamps))
 
 
 def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.commands.occupancy import OBSTACLE_FROM_M, OBSTACLE_TO_M, Grid, ground_along
+from slam.commands.export import OBSTACLE_FROM_M, OBSTACLE_TO_M, Grid, ground_along
 from slam.geometry.se3 import FloatArray, apply
 from slam.mapping.views import has_moved
 

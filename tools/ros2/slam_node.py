@@ -29,9 +29,8 @@ from slam.config.sections import load_config
 from slam.formats.trajectory import write_tum
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SlamError
-from slam.sequences.camera_file import DEFAULT_FPS
-from slam.sequences.ros.messages import camera_file_of, image_of, is_rectified
-from slam.sequences.undistortion import Undistortion, undistorted
+from slam.sequences.bag import camera_file_of, image_of, is_rectified
+from slam.sequences.camera_file import DEFAULT_FPS, Undistortion, undistorted
 
 T_MAP_WORLD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # without a base
 STRIDE = 2  # pixels of the kept depth

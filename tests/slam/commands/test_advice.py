@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from slam.commands.evaluation import compare
-from slam.commands.live import StreamedSequence
-from slam.commands.live_source import FolderSource
+from slam.commands.live import FolderSource, StreamedSequence
 from slam.formats.trajectory import read_trajectory
 from slam.runtime.errors import SlamError
 from slam.sequences.camera_file import explicit_camera

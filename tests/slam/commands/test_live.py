@@ -23,8 +23,7 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live import LiveRequest, StreamedSequence, run_live
-from slam.commands.live_source import FolderSource, VideoSource, open_source
+from slam.commands.live import FolderSource, LiveRequest, StreamedSequence, VideoSource, open_source, run_live
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
 from slam.sequences.camera_file import explicit_camera

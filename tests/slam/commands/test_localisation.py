@@ -23,7 +23,7 @@ from slam.loops.recognition import FeatureExtractor
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
-from slam.sequences.simulated import SimulatedSequence
+from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
 UNIT = 0.5  # lengths of the map per metre

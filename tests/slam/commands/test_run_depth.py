@@ -16,7 +16,7 @@ import slam.commands.cli
 from slam import Slam, run_slam
 from slam.commands.localisation import localise
 from slam.config.sections import DepthConfig, load_config
-from slam.prediction.depth_folder import DepthFolder, FrameNumbers
+from slam.prediction.depth_source import DepthFolder, FrameNumbers
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence

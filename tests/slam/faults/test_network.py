@@ -29,5 +29,5 @@ def test_onnx_runtime_keeps_nothing_to_report(tmp_path: Path) -> None:
     """Unless told not to, it reports to its maker, by an identifier that it keeps in the home folder."""
     environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
     place = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    subprocess.run([sys.executable, "-c", "import slam.prediction.onnx_depth"], env=environment | place, check=True)
+    subprocess.run([sys.executable, "-c", "import slam.prediction.depth_source"], env=environment | place, check=True)
     assert not list(tmp_path.rglob("*onnxruntime*"))

@@ -17,7 +17,7 @@ from slam.loops.recognition import FeatureExtractor
 from slam.mapping.depth_refinement import DepthRefiner
 from slam.mapping.submap import Fusion
 from slam.pipeline.run import SlamPipeline
-from slam.sequences.simulated import SimulatedSequence
+from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
 FRAMES = 30

@@ -18,7 +18,7 @@ from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed
-from slam.runtime.timing import Stopwatch
+from slam.runtime.resources import Stopwatch
 
 
 def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:

@@ -16,7 +16,7 @@ from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.geometry.se3 import apply, is_se3
 from slam.pipeline.run import SlamPipeline
 from slam.runtime.errors import SlamError
-from slam.sequences.simulated import SimulatedSequence
+from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
 FACTOR = 0.2

@@ -24,8 +24,8 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline, read_frame
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError
-from slam.runtime.timing import Stopwatch
-from slam.sequences.simulated import SimulatedSequence
+from slam.runtime.resources import Stopwatch
+from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
 FRAMES = 40

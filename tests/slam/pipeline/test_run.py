@@ -27,7 +27,7 @@ from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.runtime.errors import Failed, SlamError
-from slam.sequences.simulated import SimulatedSequence
+from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)

@@ -9,7 +9,7 @@ from meshes import coloured_ply
 from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.report.map_view import MapView, map_view
+from slam.results.report.figures import MapView, map_view
 
 HALF_M, STEP_M, GROUND_M = 80.0, 2.0, 1.65
 

@@ -1,7 +1,8 @@
-"""A run folder holds whole files or none."""
+"""A run folder holds whole files or none; its log is complete from the first line, and never ends the run."""
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,11 +11,12 @@ from pathlib import Path
 import pytest
 
 import slam
-from slam.results.folder import RunFolder
+from slam.results.folder import RunFolder, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.runtime.errors import Failed, RunError
 
 MakeRun = Callable[..., RunFolder]
+LOGGER = logging.getLogger("slam.test")
 
 
 def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
@@ -115,3 +117,23 @@ def test_a_run_opens_by_its_name_and_shows_itself(make_run: MakeRun) -> None:
     (path / "map_mesh.ply").unlink()
     with pytest.raises(RunError, match=r"has no map_mesh\.ply"):
         run.mesh()
+
+
+def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with run_log() as log:
+        LOGGER.info("checked")
+        log.begin(tmp_path / "run.log")
+        for frame in range(9):
+            LOGGER.info("frame %d failed: %s", frame, "no road")
+        log.failed("no space")
+    LOGGER.warning("after it")
+    lines = (tmp_path / "run.log").read_text().splitlines()
+    assert [line.split(" ", 2)[2] for line in lines] == [
+        "INFO slam.test: checked",
+        "INFO slam.test: frame 0 failed: no road",
+        "ERROR slam.commands.run: the run failed: no space",
+        "INFO slam.commands.run: 9 times: no road",
+    ]
+    assert "no space" not in caplog.text

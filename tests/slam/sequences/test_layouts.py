@@ -14,8 +14,8 @@ import pytest
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import camera_of
 from slam.runtime.errors import MissingFrameError, SequenceError
+from slam.sequences.camera_file import Undistortion
 from slam.sequences.catalogue import open_sequence, sequence_kinds
-from slam.sequences.undistortion import Undistortion
 
 # EuRoC: distorted images, stamps in nanoseconds, true poses of the body, rows without an image
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from slam.sequences.catalogue import SimulatedSequence
 from slam.sequences.poses import rebased
 from slam.sequences.recording import Source, frame_range
-from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 
 

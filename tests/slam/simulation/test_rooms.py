@@ -6,9 +6,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from slam.geometry import se3
-from slam.results.truth import find_truth
-from slam.sequences.catalogue import open_sequence
-from slam.sequences.simulated import SimulatedSequence
+from slam.results.estimate_metrics import find_truth
+from slam.sequences.catalogue import SimulatedSequence, open_sequence
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.motion import FASTEST_TURN_DEG, Motion
 from slam.simulation.options import SimulationOptions

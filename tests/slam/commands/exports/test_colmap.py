@@ -16,7 +16,7 @@ from slam.loops.places import Places
 from slam.loops.recognition import FeatureExtractor
 from slam.results.folder import RunFolder
 from slam.runtime.files import PLACES
-from slam.sequences.simulated import SimulatedSequence
+from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.street import SimulationOptions
 
 FRAMES, STRIDE = 18, 2

@@ -12,8 +12,7 @@ import yaml
 from meshes import coloured_ply
 
 from slam.commands.cli import app
-from slam.commands.export import export
-from slam.commands.occupancy import FREE, OCCUPIED, UNKNOWN, ground_along, occupancy_grid
+from slam.commands.export import FREE, OCCUPIED, UNKNOWN, export, ground_along, occupancy_grid
 from slam.formats.ply import Ply
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray

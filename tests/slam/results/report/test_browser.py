@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from slam.results.folder import RunFolder
-from slam.results.report.map_view import MapView
+from slam.results.report.figures import MapView
 from slam.results.report.page import write_report
 
 MakeRun = Callable[..., RunFolder]

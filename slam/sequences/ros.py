@@ -14,19 +14,17 @@ import numpy as np
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import first_usual, stretch_of
-from slam.formats.rows import BadRows
-from slam.formats.trajectory import nearest_pairs
+from slam.formats.trajectory import BadRows, nearest_pairs
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SequenceError
+from slam.sequences import bag as bags
+from slam.sequences.bag import Bag, is_bag, is_rectified
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.images import ReadImages
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near, poses_of
 from slam.sequences.recording import ArrayReader, RecordedSequence, Source
-from slam.sequences.ros import messages as ros
-from slam.sequences.ros.bag import Bag, is_bag
-from slam.sequences.ros.messages import is_rectified
 
 logger = logging.getLogger(__name__)
 
@@ -98,16 +96,16 @@ class StampedMessages:
 
     def points(self, index: int, where: str) -> FloatArray:
         """The points ``(P, 3)`` of a cloud, metres; ``where`` names it in errors."""
-        return ros.points_of(self.read(index), where)
+        return bags.points_of(self.read(index), where)
 
 
 def images_of(messages: StampedMessages, where: str) -> ReadImages:
     """The images of a topic, all of the size of the first readable ones; not for use from several threads."""
     rows = range(len(messages))
-    stretch = stretch_of(rows, lambda row: ros.values_of(messages.read(row), where))
+    stretch = stretch_of(rows, lambda row: bags.values_of(messages.read(row), where))
 
     def decode(row: int) -> Image:
-        return ros.image_of(messages.read(row), where, stretch)
+        return bags.image_of(messages.read(row), where, stretch)
 
     height, width = first_usual(rows[:_SOUGHT_IMAGES], decode)[1].shape[:2]
 
@@ -197,21 +195,21 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
 def camera_topics(path: Path) -> list[str]:
     """Topics of a bag with pictures of a camera, not depth; rectified ones in place of the same camera's raw ones."""
     with closing(Bag(path)) as bag:
-        images = bag.topics(ros.IMAGE, ros.COMPRESSED_IMAGE)
-        topics = [topic for topic in images if ros.shows_pictures(bag.first(topic), topic)]
+        images = bag.topics(bags.IMAGE, bags.COMPRESSED_IMAGE)
+        topics = [topic for topic in images if bags.shows_pictures(bag.first(topic), topic)]
     rectified = {_home(topic) for topic in topics if is_rectified(topic)}
     return [topic for topic in topics if is_rectified(topic) or _home(topic) not in rectified]
 
 
 def _calibration(bag: Bag, topic: str, fps: float, size: tuple[int, int]) -> CameraFile:
     """By the ``camera_info`` beside the images."""
-    known = bag.topics(ros.CAMERA_INFO)
+    known = bag.topics(bags.CAMERA_INFO)
     base, home = topic.removesuffix("/compressed"), _home(topic)
     info = next((name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None)
     if info is None:
         held = ", ".join(known) or "no camera_info"
         raise SequenceError(f"no {home}/camera_info for {topic} in {bag.path}: it has {held}; give --camera")
-    return ros.camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
+    return bags.camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
 
 
 def _home(topic: str) -> str:
@@ -268,7 +266,7 @@ def _scans(
 
     A frame has the cloud nearest to it, if within 50 ms and not nearer to another frame.
     """
-    for topic in bag.topics(ros.POINT_CLOUD):
+    for topic in bag.topics(bags.POINT_CLOUD):
         T_camera_lidar = transform_between(mounts, camera, bag.first(topic).header.frame_id)
         if T_camera_lidar is None:
             logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
@@ -282,8 +280,8 @@ def _scans(
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     """The cameras of a bag by topic; those of a folder of bags by bag, and by topic where a bag has several."""
     if not is_bag(path):
-        bags = sorted(filter(is_bag, path.iterdir())) if path.is_dir() else []
-        found = {bag: _cameras(bag, asked) for bag in bags}
+        paths = sorted(filter(is_bag, path.iterdir())) if path.is_dir() else []
+        found = {bag: _cameras(bag, asked) for bag in paths}
         return {
             f"{bag.stem}{topic}" if len(cameras) > 1 else bag.stem: opener
             for bag, cameras in found.items()

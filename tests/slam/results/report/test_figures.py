@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import slam.results.report.map_view
+import slam.results.report.figures
 from slam.formats.ply import Ply, write_ply
-from slam.results.report.map_view import MapMesh, thinned_mesh
+from slam.results.report.figures import MapMesh, thinned_mesh
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def area(mesh: MapMesh) -> float:
 @pytest.mark.parametrize("most", [0, 1_000_000])
 def test_a_thinned_map_keeps_its_surface_and_colours(path: Path, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
     """By cells first, as a large one, and by quadric errors alone."""
-    monkeypatch.setattr(slam.results.report.map_view, "_MOST_TRIANGLES", most)
+    monkeypatch.setattr(slam.results.report.figures, "_MOST_TRIANGLES", most)
     whole, mesh = thinned_mesh(path, 100_000), thinned_mesh(path, 2000)
     assert 1000 < len(mesh.triangles) <= 2000 < len(whole.triangles)
     assert mesh.triangles.max() < len(mesh.points) == len(mesh.colours)

@@ -1,14 +1,15 @@
-"""Spilled arrays are read back unchanged, and a full disk is one clear error."""
+"""Spilled arrays are read back unchanged, a full disk is one clear error, and times add up by stage."""
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.spill import SpillFile
+from slam.runtime.resources import SpillFile, Stopwatch
 
 
 def test_arrays_come_back_in_any_order() -> None:
@@ -40,3 +41,17 @@ def test_a_file_that_was_cut_short_is_an_error_and_no_garbage() -> None:
     spill_file._file.truncate(5000)
     with pytest.raises(SlamError, match=r"cannot be read .*: run again"):
         kept.read()
+
+
+def test_a_stage_adds_up_over_its_visits_also_when_it_fails() -> None:
+    watch = Stopwatch()
+    with watch.stage("read"):
+        time.sleep(0.001)
+    once = watch.stages["read"]
+    with pytest.raises(ZeroDivisionError), watch.stage("read"):
+        _ = 1 / 0
+    with watch.stage("map"):
+        pass
+    assert list(watch.stages) == ["read", "map"]
+    assert 0 < once < watch.stages["read"]
+    assert sum(watch.stages.values()) <= watch.seconds

@@ -1,1 +1,0 @@
-"""Storage on disk: atomic files and spilled arrays."""

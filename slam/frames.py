@@ -239,6 +239,21 @@ class TrackingEvent:
         return f"frame {self.frame}: {self.event}{at}{by}"
 
 
+@dataclass(frozen=True)
+class GpsTrack:
+    """Fixes of a GPS receiver.
+
+    Attributes:
+        stamps: seconds ``(M,)``, increasing.
+        places: latitude and longitude in degrees, height over the ellipsoid or the sea in metres, ``(M, 3)``.
+        dilution: of precision, factors on the usual sigmas of a fix ``(M,)``.
+    """
+
+    stamps: FloatArray
+    places: FloatArray
+    dilution: FloatArray
+
+
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     """Unbroken runs of frame numbers as (first, last)."""
     found: list[tuple[int, int]] = []

@@ -110,7 +110,7 @@ def test_only_command_lines_and_tools_print() -> None:
 
 
 def test_each_heavy_library_has_one_home() -> None:
-    assert uses("gtsam") == {"slam/graph/pose_graph.py", "slam/graph/similarity_graph.py"}
+    assert uses("gtsam") == {"slam/graph/pose_graph.py"}
     assert uses("evo") == {"slam/evaluation/trajectory.py"}
     assert uses("open3d") == set()  # through the door of slam/runtime/imports.py
     assert all(name.startswith("erfsfm/training/") for name in uses("lightning"))

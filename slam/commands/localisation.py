@@ -20,12 +20,10 @@ from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.geometry.resection import consensus, resect
+from slam.geometry.multiview import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places, PlaceStructure
-from slam.loops.retrieval import PlaceIndex
-from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
+from slam.loops.recognition import OF_FRAMES, OF_KEYFRAMES, FeatureExtractor, PlaceIndex, hamming, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
@@ -200,7 +198,7 @@ class Localiser:
 
     def _found(self, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
-        starts = [start for row in rows if (start := self._start(row, view, learned)) is not None]
+        starts = [start for row in rows if len((start := self._start(row, view, learned))[1])]
         starts.sort(key=lambda start: len(start[1]), reverse=True)
         found = [self._refined(T_camera_world, rows, view, learned) for T_camera_world, _ in starts[:_STARTS]]
         nowhere = Localisation(reason="no place has corners that fit one pose")
@@ -225,13 +223,13 @@ class Localiser:
             return Localisation(reason=f"{count} corners agree, but give the position to {sigma:.1%} of their depth")
         return Localisation(T_world_camera=invert(T_camera_world), inliers=count)
 
-    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]] | None:
+    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]]:
         """The pose by one place, as `consensus` gives it."""
         corners, seen = matches(self._places.views[row], view, self._thresholds)
         points = self._structure.points(row, learned)[corners]
         known = np.isfinite(points).all(axis=1)
         if known.sum() < _LEAST_POINTS:
-            return None
+            return np.eye(4), corners[:0]
         pixels = view.pixels[seen[known]].astype(np.float64)
         return consensus(points[known], pixels, self._intrinsics.K, _SAMPLES, self._thresholds.reprojection_px)
 

@@ -96,7 +96,7 @@ class VisualOdometryConfig(Section):
 
 
 class RoadConfig(Section):
-    """Step lengths from the homography of the ground plane, see ``frontend/scale/road_homography.py``."""
+    """Step lengths from the homography of the ground plane, see ``frontend/road.py``."""
 
     enabled: bool = Field(
         default=True, description="measure steps by the homography of the ground plane, in camera heights"
@@ -113,7 +113,7 @@ class KeyframesConfig(Section):
 
 
 class GapsConfig(Section):
-    """Gap interpolation over unusable frames, see ``frontend/gap_interpolation.py`` and ``frontend/image_gate.py``."""
+    """Gap interpolation over unusable frames, see ``frontend/completion.py`` and ``frontend/image_gate.py``."""
 
     enabled: bool = Field(
         default=True,
@@ -138,7 +138,7 @@ class GpsConfig(Section):
 
 
 class ScaleConfig(Section):
-    """Metric scale, see ``frontend/scale/road_plane.py``."""
+    """Metric scale, see ``frontend/scale.py``."""
 
     mode: Literal["auto", "none", "camera-height", "lidar", "reference", "known", "gps"] = Field(
         default="auto", description="auto: camera-height where a height is known, else gps with --gps, else none"

@@ -13,9 +13,8 @@ import numpy as np
 
 from slam.frames import Ends, Intrinsics, RelativePose, runs
 from slam.frontend.drive import Drive, named
-from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion, triangulated
+from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.runtime.errors import Failed, SlamError

@@ -23,13 +23,11 @@ from slam.frames import (
     resized_depth,
     runs,
 )
-from slam.frontend.keyframes.local_map import MapSegment
+from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.keyframes.relative_poses import KeyframePoses
-from slam.frontend.scale.road_homography import RoadStep
-from slam.frontend.scale.road_plane import GroundPlane
-from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.focal_length import FocalLength
+from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
+from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
 from slam.runtime.resources import SpilledArray, SpillFile
@@ -98,12 +96,13 @@ class Drive:
     Collected frame by frame, each list and dictionary growing at its end:
         ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
         ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
-        ``roads`` has one entry a frame. ``unusable`` are frames without a measurement, with the reason, ``repeated``
-        frames with the image of the one before, ``moving`` those of them just before which the camera moved.
-        ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as the steps have them.
-        ``maps`` are those of keyframes and ``events`` what became of them; a drive measured by steps alone has none.
+        ``roads`` has one entry a frame, the camera's height over the ground plane. ``unusable`` are frames without a
+        measurement, with the reason, ``repeated`` frames with the image of the one before, ``moving`` those of them
+        just before which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the one that
+        corners show, as the steps have them. ``maps`` are those of keyframes and ``events`` what became of them; a
+        drive measured by steps alone has none.
 
-    Added by `slam.frontend.gap_interpolation.complete_drive`, which also leaves out views and keyframes of interpolated
+    Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of interpolated
     frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
         ``trusted`` are the snippets that the network measured on usable frames, ``interpolated`` the frames of gaps
         with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by the maps.
@@ -114,7 +113,7 @@ class Drive:
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: list[RelativeRotation] = field(default_factory=list)
     failures: list[tuple[int, int, str]] = field(default_factory=list)
-    roads: list[GroundPlane | Failed] = field(default_factory=list)
+    roads: list[float | Failed] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
     unusable: dict[int, str] = field(default_factory=dict)
@@ -127,7 +126,7 @@ class Drive:
     interpolated: dict[int, str] = field(default_factory=dict)
     gap_steps: list[RelativePose] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
-    maps: list[MapSegment] = field(default_factory=list)
+    maps: list[LocalMap] = field(default_factory=list)
     map_poses: KeyframePoses = field(default_factory=KeyframePoses)
     events: list[TrackingEvent] = field(default_factory=list)
 
@@ -174,34 +173,29 @@ class Drive:
             """The items that begin in the window, of items in order of time that may span a few frames."""
             return list(takewhile(lambda item: start(item) >= first, items))[::-1]
 
+        def moved(motion: Motion) -> Motion:
+            pose, (a, b) = motion.relative_pose, motion.ends
+            return replace(motion, relative_pose=replace(pose, from_index=a - first, to_index=b - first))
+
         return Drive(
             snippets=[
                 replace(s, target=s.target - first, sources=tuple(source - first for source in s.sources))
                 for s in last(reversed(self.snippets), lambda s: min(s.sources))
             ],
-            motions=[
-                replace(motion, relative_pose=_moved(motion.relative_pose, first))
-                for motion in last(reversed(self.motions), lambda m: m.ends[0])
-            ],
+            motions=[moved(motion) for motion in last(reversed(self.motions), lambda m: m.ends[0])],
             road_steps={
                 (ends[0] - first, ends[1] - first): step
                 for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0])
             },
             relative_rotations=[
-                _moved(rotation, first) for rotation in last(reversed(self.relative_rotations), lambda r: min(r.ends))
+                replace(rotation, ends=(rotation.ends[0] - first, rotation.ends[1] - first))
+                for rotation in last(reversed(self.relative_rotations), lambda r: r.ends[0])
             ],
             failures=[(a - first, b - first, why) for a, b, why in last(reversed(self.failures), lambda f: f[0])],
             roads=self.roads[first:],
             unusable={k - first: why for k, why in last(reversed(self.unusable.items()), lambda item: item[0])},
             repeated=[k - first for k in last(reversed(self.repeated), lambda k: k)],
         )
-
-
-_Between = TypeVar("_Between", RelativePose, RelativeRotation)
-
-
-def _moved(measured: _Between, first: int) -> _Between:
-    return replace(measured, from_index=measured.from_index - first, to_index=measured.to_index - first)
 
 
 def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:

@@ -1,30 +1,41 @@
-"""All relative-pose factors of a run, made once from all measurements, and the odometry chained from them."""
+"""All relative-pose factors of a run, made once from all measurements, and the odometry chained from them.
+
+The pose network's lengths have a unit of their own, which is not that of learned depth and changes with the street.
+Both it and the network's noise are measured against the steps of image geometry (``docs/design/learned-priors.md``).
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from slam.frames import KEYFRAME_SOURCE, RelativePose
+from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses, runs
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import join_gap_ends
-from slam.frontend.keyframes.relative_poses import KeyframePoses
-from slam.frontend.network_factors import (
-    NETWORK_SOURCE,
-    STUDENT_T_DOF,
-    calibrate_network,
-    network_factors,
-    network_steps,
-)
-from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.visual.motion import Steps, triangulated
-from slam.frontend.visual.step_noise import step_noise
-from slam.geometry.se3 import FloatArray, compose, rigid
+from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
+from slam.frontend.scale import Scale
+from slam.frontend.visual.motion import step_noise, triangulated
+from slam.geometry.robust import MAD_TO_SIGMA, running_median
+from slam.geometry.se3 import FloatArray, chain, compose, from_rotation_vector, invert, rigid, tangent
 
 logger = logging.getLogger(__name__)
+NETWORK_SOURCE = "network"
+STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
+LEAST_PAIRS = 20  # steps that image geometry measured too, from which on unit and noise are measured
+_NEAREST_PAIRS = 40  # in time, by which they are measured
+_LONGEST_PAIR = 4  # frames: as far as a snippet reaches
+_SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
+_CORRELATED_STEPS = 50  # over which errors are taken as equal
+# of a step whose noise is not measured: radians, and over its length in the unit of learned depth, from which that of
+# the network differs by so much from drive to drive
+_USUAL_SIGMAS = np.repeat([np.deg2rad(0.3), 0.3], 3)
+_LEAST_SIGMAS = np.repeat([np.deg2rad(0.03), 0.02], 3)
 
 
 def make_factors(
@@ -36,7 +47,15 @@ def make_factors(
     those of image geometry. What the pose network measured is a line in the log of this ``level``.
     """
     maps = drive.map_poses
-    geometric = _geometric(drive.steps, scale)
+    geometric = []
+    noise = step_noise(triangulated(drive.steps), len(scale.per_frame))
+    for ends, motion in drive.steps.items():
+        length = scale.lengths.get(ends)
+        if motion.is_triangulated and length is not None:
+            pose = motion.with_length(*length, noise[ends])
+            geometric.append(replace(pose, student_t_dof=STUDENT_T_DOF))
+        else:  # its length is that by learned depth
+            geometric.append(scale.scaled(motion.relative_pose))
     by_keyframes = scaled_poses(maps.poses, maps, scale)
     steps = network_steps(drive.trusted)
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
@@ -87,15 +106,176 @@ def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
     return factor.source == KEYFRAME_SOURCE, factor.source != NETWORK_SOURCE, factor.from_index
 
 
-def _geometric(steps: Steps, scale: Scale) -> list[RelativePose]:
-    """Every step of image geometry: with its own length where that was measured, else by learned depth."""
-    noise = step_noise(triangulated(steps), len(scale.per_frame))
+@dataclass(frozen=True)
+class NetworkCalibration:
+    """Unit and noise of the pose network's steps from each of N frames, measured on the drive.
+
+    Attributes:
+        unit: ``(N,)``, length per unscaled length of the step.
+        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length of a step.
+        pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that of learned depth.
+    """
+
+    unit: FloatArray
+    sigmas: FloatArray
+    pairs: int
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether enough steps measured the unit and the noise."""
+        return self.pairs >= LEAST_PAIRS
+
+    def over(self, depth_unit: FloatArray) -> str:
+        """The unit over that of learned depth ``(N,)`` and the noise, for logs."""
+        if not self.is_measured:
+            return f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
+        least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
+        rotation, translation = np.rad2deg(np.median(self.sigmas[:, :3])), np.median(self.sigmas[:, 5])
+        return (
+            f"by {self.pairs} steps its unit is {usual:.2f} ({least:.2f} to {most:.2f}) of that of learned depth, and "
+            f"its noise {rotation:.2f} degrees and {100 * translation:.0f} % of a step"
+        )
+
+    def scaled(self, steps: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """Steps ``T_k_next`` by k in the unit."""
+        scaled = {k: T_k_next.copy() for k, T_k_next in steps.items()}
+        for k, T_k_next in scaled.items():
+            T_k_next[:3, 3] *= self.unit[k]
+        return scaled
+
+
+def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
+    """``T_k_next`` by k, unscaled: the mean of the snippets that see both frames."""
+    seen: dict[int, list[FloatArray]] = {}
+    for snippet in snippets:
+        for k, T_k_next in _steps(snippet).items():
+            seen.setdefault(k, []).append(T_k_next)
+    means = rigid(np.array([np.mean(each, axis=0) for each in seen.values()]).reshape(-1, 4, 4))
+    return dict(sorted(zip(seen, means, strict=True), key=lambda step: step[0]))
+
+
+def calibrate_network(
+    steps: Mapping[int, FloatArray], geometric: Sequence[RelativePose], depth_unit: FloatArray
+) -> NetworkCalibration:
+    """The unit and the noise of the network's steps, by the poses that image geometry measured too.
+
+    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths are in the unit of
+    learned depth, and accordingly uncertain. Steps ``T_k_next`` are unscaled; ``depth_unit`` ``(N,)`` is the unit of
+    the ``geometric`` poses per unit of learned depth at each frame.
+    """
+    measured = (p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR)
+    pairs = [p for p in measured if steps.keys() >= set(range(*p.ends))]
+    if len(pairs) < LEAST_PAIRS:
+        return _by_depth(depth_unit, len(pairs))
+    first, last = np.array([p.ends for p in pairs]).T
+    T_network = np.array([reduce(np.matmul, (steps[k] for k in range(*p.ends))) for p in pairs])
+    T_geometric = np.array([p.T_from_to for p in pairs])
+    t_network, t_geometric = T_network[:, :3, 3], T_geometric[:, :3, 3]
+    length, frames = np.linalg.norm(t_geometric, axis=1), last - first
+    # along the measured motion, where the network's noise has no bias, as it has in the length
+    ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
+    used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
+    if used.sum() < LEAST_PAIRS:
+        return _by_depth(depth_unit, int(used.sum()))
+    unit = 1.0 / _nearest_median(first[used], ratio[used], len(depth_unit))
+    t_network *= unit[first, None]
+    reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
+    error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
+    # the unit follows image geometry, and so shares its errors
+    shared = np.array([p.sigmas for p in pairs])[used] / reach[used]
+    own, of_geometry = (_nearest_median(first[used], values, len(unit)) for values in (error, shared))
+    sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
+    return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
+
+
+def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibration) -> list[RelativePose]:
+    """A factor for every step ``T_k_next`` of the network, in the unit of the calibration."""
+    if not steps:
+        return []
+    scaled = calibration.scaled(steps)
+    lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
+    # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
+    usual = running_median(lengths, _NEAREST_PAIRS + 1)
+    reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
+    # with nothing beside them, the usual sigmas are wide enough by themselves
+    widening = np.sqrt(_CORRELATED_STEPS) if calibration.is_measured else 1.0
     factors = []
-    for ends, motion in steps.items():
-        length = scale.lengths.get(ends)
-        if not motion.is_triangulated or length is None:
-            factors.append(scale.scaled(motion.relative_pose))
-            continue
-        pose = motion.with_length(*length, noise[ends])
-        factors.append(replace(pose, student_t_dof=STUDENT_T_DOF))
+    for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
+        sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)
+        factors.append(RelativePose(k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widening * sigmas, STUDENT_T_DOF))
     return factors
+
+
+def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
+    """The raw network trajectory: target to next source of each snippet, without a graph.
+
+    Frames before the first target and after the last come from the direct poses of these two snippets. There is one a
+    target, in time order without gaps.
+
+    Returns:
+        ``T_world_camera`` ``(count, 4, 4)``, unscaled, the first the identity.
+    """
+    steps: dict[int, FloatArray] = {}
+    for snippet in snippets:
+        steps |= {k: T for k, T in _steps(snippet).items() if k == snippet.target or k not in steps}
+    return chain(np.array([steps[k] for k in range(count - 1)]))
+
+
+def _steps(snippet: SnippetPoses) -> dict[int, FloatArray]:
+    T_target = snippet.T_target_camera
+    return {k: invert(T_target[k]) @ T_target[k + 1] for k in range(min(snippet.sources), max(snippet.sources))}
+
+
+def _by_depth(depth_unit: FloatArray, pairs: int) -> NetworkCalibration:
+    return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), pairs)
+
+
+def _nearest_median(frames: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
+    """The median value ``(count, ...)`` of the pairs nearest to each frame, of pairs ``(P, ...)`` by first frames."""
+    order, width = np.argsort(frames, kind="stable"), min(_NEAREST_PAIRS, len(frames))
+    windows = np.lib.stride_tricks.sliding_window_view(values[order], width, axis=0)
+    place = np.searchsorted(frames[order], np.arange(count)) - width // 2
+    return np.asarray(np.median(windows, axis=-1)[np.clip(place, 0, len(windows) - 1)])
+
+
+def equal_step(T_a_b: FloatArray, n: int) -> FloatArray:
+    """One of n equal steps from a to b: the transform ``(4, 4)`` whose n-th power is ``T_a_b``."""
+    rotation_vector = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
+    powers = Rotation.from_rotvec(np.arange(n)[:, None] * rotation_vector).as_matrix()
+    return from_rotation_vector(rotation_vector, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))
+
+
+def join_gap_ends(
+    interpolated: Sequence[RelativePose],
+    measured: Sequence[RelativePose],
+    by_map: Sequence[RelativePose],
+    maps: Mapping[int, int],
+) -> list[RelativePose]:
+    """The interpolated steps. Equal steps across a gap replace the steps in the gap if one map has both sides.
+
+    Constant velocity is a poor guess over a long gap, and many such steps would outvote the one pose by the map.
+
+    Args:
+        interpolated: steps without a measurement, in one unit with all others.
+        measured: steps between other frames.
+        by_map: relative poses within maps.
+        maps: the map of each frame that has a pose in one.
+    """
+    T_map_camera = chained(by_map)
+    loose = {pose.from_index: pose for pose in interpolated}
+    T_step = {pose.from_index: pose.T_from_to for pose in measured if pose.to_index == pose.from_index + 1}
+    T_step |= {first: pose.T_from_to for first, pose in loose.items()}
+    for first, last in pairwise(sorted(maps)):
+        steps = range(first, last)
+        if maps[first] != maps[last] or loose.keys().isdisjoint(steps) or not T_step.keys() >= set(steps):
+            continue
+        begin, end = max(runs(loose.keys() & set(steps)), key=lambda run: run[1] - run[0])
+        T_first_begin = reduce(np.matmul, (T_step[k] for k in range(first, begin)), np.eye(4))
+        T_end_last = reduce(np.matmul, (T_step[k] for k in range(end + 1, last)), np.eye(4))
+        T_first_last = invert(T_map_camera[first]) @ T_map_camera[last]
+        T = equal_step(invert(T_first_begin) @ T_first_last @ invert(T_end_last), end + 1 - begin)
+        length = float(np.linalg.norm(T[:3, 3]))
+        for k in range(begin, end + 1):
+            sigmas = np.maximum(loose[k].sigmas, [0.0, 0.0, 0.0, length, length, length])
+            loose[k] = replace(loose[k], T_from_to=T, sigmas=sigmas)
+    return list(loose.values())

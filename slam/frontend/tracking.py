@@ -2,28 +2,38 @@
 
 With a flow predicted from learned depth and the last motion, corners are tracked in the image warped back by it. Those
 that are not found there and back, as on other cars, are tracked in the image as it is.
+
+From a moving car a window on the road is stretched by a fifth from frame to frame, one on a near wall by a tenth.
+Lucas-Kanade shifts windows without stretching them. It then locks onto whatever part of a window has most texture:
+single corners have errors of half a pixel, and those on the road all upwards, which resembles a pitching camera
+(``docs/design/visual-front-end.md``). Warping the later image back by the predicted flow removes the stretch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Frame, Grey, Mask, nearest, resized_mask
-from slam.frontend.visual.predicted_flow import PredictedFlow
-from slam.geometry.se3 import FloatArray
+from slam.frames import DepthMap, Frame, Grey, Intrinsics, Mask, nearest, resized_mask
+from slam.geometry.multiview import UnitRelativePose
+from slam.geometry.se3 import FloatArray, invert
 
 Pixels = NDArray[np.float32]
 _TERMINATION = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
 # least eigenvalue of a window's gradients: a tenth of what OpenCV wants, for plain walls
 _LEAST_TEXTURE = 1e-5
 _TILES = 3, 4  # down and across: corners are spread over them
+_NEAREST = 1e-6
+_INVERSIONS = 2
+_DEPTH_WIDTH_PX = 400
+_GRID_PX = 3  # the flow is computed at every third pixel: learned depth has no finer detail
 
 
 class Search(NamedTuple):
@@ -53,9 +63,9 @@ class Texture(NamedTuple):
     block_px: int
 
 
-OF_STEPS = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
+STEP_SEARCH = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half the time of 15
-OF_KEYFRAMES = Search(side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
+KEYFRAME_SEARCH = Search(side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
 MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
 STEP_CORNERS = Texture(quality=0.008, spacing_px=11.0, block_px=5)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
@@ -217,9 +227,11 @@ class CornerTracker:
 
         def find() -> Tracks:
             images = previous.grey, predicted_flow.warp_back(current.grey)
-            pixels, kept = _lucas_kanade(*images, points, points, OF_STEPS.side, _PREDICTED_LEVELS, OF_STEPS.limits)
+            pixels, kept = _lucas_kanade(
+                *images, points, points, STEP_SEARCH.side, _PREDICTED_LEVELS, STEP_SEARCH.limits
+            )
             pixels = predicted_flow.in_current(pixels)
-            kept &= np.linalg.norm(pixels - by_steps, OF_STEPS.norm, axis=1) < _ACROSS_PX
+            kept &= np.linalg.norm(pixels - by_steps, STEP_SEARCH.norm, axis=1) < _ACROSS_PX
             before, now = points[kept].astype(np.float64), pixels[kept].astype(np.float64)
             return Tracks(before, now, track_ids[kept], len(kept))
 
@@ -242,7 +254,12 @@ def _tracked(
     flows = [predicted_flow, None] if predicted_flow else [None]
     pixels, kept = _by_first_flow(first, second, points, flows)
     if kept.sum() < FEW_CORNERS:
-        exposed = _histogram_matched(second, first)
+        # the second image with its histogram matched to that of the first
+        ranks_first, ranks = (
+            np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (first, second)
+        )
+        levels = np.interp(ranks, ranks_first, np.arange(256.0))
+        exposed = np.asarray(cv2.LUT(second, np.rint(levels).astype(np.uint8)))
         pixels_wide, kept_wide = _by_first_flow(first, exposed, points, flows, _WIDE_WINDOW_PX)
         if kept_wide.sum() > kept.sum():
             return pixels_wide, kept_wide
@@ -250,22 +267,102 @@ def _tracked(
 
 
 def _by_first_flow(
-    first: Grey, second: Grey, points: Pixels, flows: Sequence[PredictedFlow | None], side: int = OF_STEPS.side
+    first: Grey, second: Grey, points: Pixels, flows: Sequence[PredictedFlow | None], side: int = STEP_SEARCH.side
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``."""
     pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
     for flow in flows:
         tried = np.flatnonzero(~kept)
-        levels = OF_STEPS.levels if flow is None else _PREDICTED_LEVELS
+        levels = STEP_SEARCH.levels if flow is None else _PREDICTED_LEVELS
         image = second if flow is None else flow.warp_back(second)
-        moved, found_back = track(first, image, points[tried], OF_STEPS._replace(side=side, levels=levels))
+        moved, found_back = track(first, image, points[tried], STEP_SEARCH._replace(side=side, levels=levels))
         moved = moved[found_back]
         pixels[tried[found_back]], kept[tried[found_back]] = moved if flow is None else flow.in_current(moved), True
     return pixels, kept & are_inside(pixels, second.shape)
 
 
-def _histogram_matched(grey: Grey, other: Grey) -> Grey:
-    """An image ``(H, W)`` with its histogram matched to that of another."""
-    ranks, ranks_other = (np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (grey, other))
-    levels = np.interp(ranks, ranks_other, np.arange(256.0))
-    return np.asarray(cv2.LUT(grey, np.rint(levels).astype(np.uint8)))
+@dataclass(frozen=True, eq=False)
+class PredictedFlow:
+    """Flow of the pixels of an image under a motion (``unit_pose``, ``length``) in a static scene.
+
+    ``length`` and ``depth_previous`` ``(H, W)`` are in one unit; pixels without depth are taken as infinitely far.
+    """
+
+    unit_pose: UnitRelativePose
+    length: float
+    depth_previous: DepthMap
+    intrinsics: Intrinsics
+
+    @classmethod
+    def of(cls, T_previous_current: FloatArray, depth_previous: DepthMap, intrinsics: Intrinsics) -> Self | None:
+        """By a pose in the unit of the depth; None where it has no length."""
+        known = UnitRelativePose.of(invert(T_previous_current))
+        return None if known is None else cls(*known, depth_previous, intrinsics)
+
+    def warp_back(self, current: Grey) -> Grey:
+        """The later image ``(H, W)`` warped to the earlier one, equal to it where the prediction is right."""
+        return np.asarray(cv2.remap(current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+    def in_current(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Where pixels ``(M, 2)`` of the warped image lie in the later one."""
+        if len(pixels) == 0:
+            return pixels
+        u, v = np.ascontiguousarray(pixels.T)
+        moved = cv2.remap(self._current, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(moved, dtype=np.float32).reshape(-1, 2)
+
+    def depth_current(self) -> DepthMap:
+        """Z-depth ``(H, W)`` of the later image, of the surfaces that the earlier one shows; NaN where unknown.
+
+        Of large images it is computed at about the size at which networks see them.
+        """
+        height, width = self.depth_previous.shape
+        ratio = width // _DEPTH_WIDTH_PX
+        if ratio > 1:
+            size = width // ratio, max(height // ratio, 1)
+            depth = cv2.resize(self.depth_previous, size, interpolation=cv2.INTER_NEAREST_EXACT)
+            small = PredictedFlow(self.unit_pose, self.length, np.asarray(depth), self.intrinsics.resized(*size))
+            later = small.depth_current()
+            return np.asarray(cv2.resize(later, (width, height), interpolation=cv2.INTER_NEAREST_EXACT))
+        grid = _pixels(self.intrinsics)
+        flow = self._current - grid
+        before = grid - flow
+        for _ in range(_INVERSIONS - 1):  # fixed point: a pixel less the flow that ends there
+            before = grid - cv2.remap(flow, before, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        turned, moved = self._projection
+        x, y = before[..., 0], before[..., 1]
+        depth = cv2.remap(self.depth_previous, before, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        later = depth * (turned[2, 0] * x + turned[2, 1] * y + turned[2, 2]) + moved[2]
+        return np.where((depth > 0) & (later > 0), later, np.float32(np.nan))
+
+    @cached_property
+    def _projection(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """``K R K^-1`` ``(3, 3)`` and ``K t`` ``(3,)``."""
+        K = self.intrinsics.K
+        turned = K @ self.unit_pose.R_current_previous @ np.linalg.inv(K)
+        return turned.astype(np.float32), (self.length * K @ self.unit_pose.direction).astype(np.float32)
+
+    @cached_property
+    def _current(self) -> NDArray[np.float32]:
+        """Pixels of the later image ``(H, W, 2)`` by those of the earlier one: ``K R K^-1 x + K t / z``."""
+        height, width = self.depth_previous.shape
+        turned, moved = self._projection
+        rows, columns = max(height // _GRID_PX, 1), max(width // _GRID_PX, 1)
+        depth = cv2.resize(self.depth_previous, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
+        v = ((np.arange(rows) + 0.5) * height / rows - 0.5).astype(np.float32)
+        u = ((np.arange(columns) + 0.5) * width / columns - 0.5).astype(np.float32)
+        near = cv2.divide(1.0, depth)
+        near[~(depth > 0)] = 0.0
+        x, y, z = (
+            cv2.scaleAdd(near, float(shift), np.add.outer(row[1] * v + row[2], row[0] * u))
+            for row, shift in zip(turned, moved, strict=True)
+        )
+        ahead = cv2.max(z, _NEAREST)
+        flow = cv2.merge([cv2.divide(x, ahead) - u, cv2.divide(y, ahead) - v[:, None]])
+        return np.asarray(cv2.resize(flow, (width, height)) + _pixels(self.intrinsics))
+
+
+@lru_cache(maxsize=2)
+def _pixels(intrinsics: Intrinsics) -> NDArray[np.float32]:
+    """Each pixel's own column and row ``(H, W, 2)``."""
+    return intrinsics.pixel_grid().astype(np.float32)

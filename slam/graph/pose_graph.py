@@ -1,13 +1,18 @@
-"""The pose graph: relative poses in, the most likely trajectory out.
+"""The pose graph: relative poses in, the most likely trajectory out; and that of maps without a common unit.
 
 GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
 that order. A Huber kernel limits outliers: redescending ones do not recover from a drifted start.
+
+Poses and units of the cameras of several maps are those that agree best with measured similarities, as in Strasdat et
+al. 2010: scale drifts along a monocular map, and loops measure how far. GTSAM writes a similarity as
+``p -> s (R p + t)``.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import LOOP_SOURCE, RelativePose
-from slam.geometry.se3 import FloatArray, invert, is_se3
+from slam.geometry.se3 import FloatArray, invert, is_se3, make
 from slam.runtime.errors import SlamError
 from slam.runtime.files import write_atomically
 
@@ -67,8 +72,15 @@ class PoseGraph:
         Raises:
             SlamError: if one is not a rigid transform, links a frame to itself or has no positive sigmas.
         """
-        for relative_pose in relative_poses:
-            _check(relative_pose)
+        for edge in relative_poses:
+            name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
+            if edge.from_index == edge.to_index or min(edge.from_index, edge.to_index) < 0:
+                raise SlamError(f"{name} must link two different frames")
+            if not is_se3(edge.T_from_to):
+                raise SlamError(f"{name} is not a finite rigid transform")
+            for sigmas in (edge.sigmas, edge.graph_sigmas):
+                if sigmas.shape != (6,) or not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
+                    raise SlamError(f"{name} needs six positive sigmas; got {sigmas}")
         self.relative_poses += relative_poses
 
     def add_positions(
@@ -102,7 +114,12 @@ class PoseGraph:
                 return self._T_world_camera.copy()
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
                 reason = str(error).strip().partition("\n")[0]
-                self._drop_newest_loop(reason)
+                loops = [k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE]
+                if not loops:
+                    raise SlamError(f"the pose graph cannot be solved: {reason}") from error
+                newest = self.relative_poses.pop(loops[-1])
+                self.dropped.append(newest)
+                logger.warning("loop %d -> %d dropped from the graph: %s", *newest.ends, reason)
                 _check_connected(self.relative_poses, len(T_world_camera_initial))
         raise SlamError(f"the pose graph cannot be solved even without {len(self.dropped)} loop edges")
 
@@ -195,14 +212,6 @@ class PoseGraph:
             graph.add(gtsam.GPSFactor(frame, position, robust_noise(own)))
         return graph
 
-    def _drop_newest_loop(self, reason: str) -> None:
-        loops = [k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE]
-        if not loops:
-            raise SlamError(f"the pose graph cannot be solved: {reason}")
-        edge = self.relative_poses.pop(loops[-1])
-        self.dropped.append(edge)
-        logger.warning("loop %d -> %d dropped from the graph: %s", edge.from_index, edge.to_index, reason)
-
 
 def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: FloatArray) -> FloatArray:
     """Whitened squared 6-dof residual ``(F,)`` of each measurement at a trajectory ``(N, 4, 4)``."""
@@ -231,19 +240,64 @@ def robust_noise(sigmas: FloatArray) -> Any:
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
 
 
-def _check(edge: RelativePose) -> None:
-    name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
-    if edge.from_index == edge.to_index or min(edge.from_index, edge.to_index) < 0:
-        raise SlamError(f"{name} must link two different frames")
-    if not is_se3(edge.T_from_to):
-        raise SlamError(f"{name} is not a finite rigid transform")
-    for sigmas in (edge.sigmas, edge.graph_sigmas):
-        if sigmas.shape != (6,) or not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
-            raise SlamError(f"{name} needs six positive sigmas; got {sigmas}")
-
-
 def _pose3(T_a_b: FloatArray) -> Any:
     return gtsam.Pose3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3])
+
+
+@dataclass(frozen=True)
+class RelativeSimilarity:
+    """A measured similarity between two cameras whose units of length differ: ``p_from = scale R p_to + t``.
+
+    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of rotation and
+    translation; the last sigma is that of the logarithm of the scale.
+    """
+
+    from_index: int
+    to_index: int
+    T_from_to: FloatArray
+    scale: float
+    sigmas: FloatArray
+
+
+def optimise_similarities(
+    T_world_camera: FloatArray, scales: FloatArray, edges: Sequence[RelativeSimilarity]
+) -> tuple[FloatArray, FloatArray]:
+    """Poses and units of cameras, the first one fixed.
+
+    Args:
+        T_world_camera: start ``(K, 4, 4)``.
+        scales: start ``(K,)``: units of the world per unit of each camera.
+        edges: connect all cameras.
+
+    Returns:
+        ``T_world_camera`` ``(K, 4, 4)`` and scales ``(K,)``.
+
+    Raises:
+        SlamError: the system cannot be solved.
+    """
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, (T, scale) in enumerate(zip(T_world_camera, scales, strict=True)):
+        values.insert(k, _similarity(T, float(scale)))
+    fixed = gtsam.noiseModel.Isotropic.Sigma(7, _ANCHOR_SIGMA)
+    graph.add(gtsam.PriorFactorSimilarity3(0, values.atSimilarity3(0), fixed))
+    for edge in edges:
+        units = np.concatenate([np.ones(3), np.full(3, edge.scale), np.ones(1)])
+        measured, noise = _similarity(edge.T_from_to, edge.scale), robust_noise(edge.sigmas / units)
+        graph.add(gtsam.BetweenFactorSimilarity3(edge.from_index, edge.to_index, measured, noise))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(_MAX_ITERATIONS)
+    try:
+        solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    except RuntimeError as error:
+        raise SlamError(f"the maps cannot be joined: {str(error).strip().partition(chr(10))[0]}") from error
+    found = [solved.atSimilarity3(k) for k in range(len(T_world_camera))]
+    R = Rotation.from_matrix([each.rotation().matrix() for each in found]).as_matrix()
+    scales = np.array([each.scale() for each in found])
+    return make(R, scales[:, None] * np.array([each.translation() for each in found])), scales
+
+
+def _similarity(T_a_b: FloatArray, scale: float) -> Any:
+    return gtsam.Similarity3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3] / scale, scale)
 
 
 def _numbers(row: FloatArray) -> str:

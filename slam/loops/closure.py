@@ -1,11 +1,16 @@
-"""Loop closure over a whole run: candidates, verified loops, and the consistent ones among them."""
+"""Loop closure over a whole run: candidates, verified loops, and the consistent ones among them.
+
+Loops agree with the odometry and with each other by pairwise consistency as in PCM (Mangelson et al. 2018), between
+neighbours only: two loops whose ends are near each other must close a cycle with the two short stretches of odometry
+between their ends.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +18,8 @@ from numpy.typing import NDArray
 from erfsfm.common.processes import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
-from slam.geometry.se3 import FloatArray
-from slam.loops.consistency import Track, agreeing
-from slam.loops.retrieval import Apart, Candidate, find_candidates
-from slam.loops.verification import OF_FRAMES, Loop, LoopVerifier, RejectedLoop
+from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
+from slam.loops.recognition import OF_FRAMES, Loop, LoopThresholds, LoopVerifier, PlaceIndex, RejectedLoop
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +30,10 @@ _LEAST_PATH_OVER_DEPTH = 0.75
 _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
 _TRIED_FIRST = 4  # candidates of a view of which one must be verified before the others are tried
 _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
+_BLOCK = 256
+Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
+_SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
+_SUPPORT_DRIFT_RATIO = 0.1  # drift of the odometry between supporting loops over the path between them
 
 
 @dataclass(frozen=True)
@@ -137,4 +144,142 @@ def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
-    return [loop.widened(float(np.sqrt(count))) for loop, count in zip(loops, alike, strict=True)]
+    return [
+        replace(loop, measured=replace(loop.measured, sigmas=float(np.sqrt(count)) * loop.measured.sigmas))
+        for loop, count in zip(loops, alike, strict=True)
+    ]
+
+
+class Candidate(NamedTuple):
+    """Two similar views by their rows; ``score`` is their similarity over that of neighbouring frames.
+
+    ``rank`` counts from the best candidate of the later view, which is 0.
+    """
+
+    earlier: int
+    later: int
+    score: float
+    rank: int
+
+
+def find_candidates(views: Sequence[View], apart: Apart, thresholds: LoopThresholds) -> list[Candidate]:
+    """For each view, in time order, the most similar earlier views, the best first.
+
+    ``apart`` says of some views ``(B,)``, by their rows, and of all views whether they may make a loop ``(B, V)``.
+    """
+    if len(views) < 2 or not any(map(len, views)):
+        return []
+    weighted = PlaceIndex(views).weights
+    indices, rows = np.array([view.index for view in views]), np.arange(len(views))
+    neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
+    expected = np.maximum(np.concatenate([neighbour[:1], neighbour]), 1e-3)
+    candidates = []
+    for start in range(0, len(views), _BLOCK):
+        block = rows[start : start + _BLOCK]
+        scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
+        scores[~apart(block) | (rows >= block[:, None])] = 0.0
+        for later, row in zip(block, scores, strict=True):
+            peaks = enumerate(_peaks(row, indices, thresholds))
+            candidates += [Candidate(k, int(later), float(row[k]), rank) for rank, k in peaks]
+    return candidates
+
+
+def _peaks(scores: FloatArray, indices: NDArray[np.intp], thresholds: LoopThresholds) -> list[int]:
+    """The best columns, none near a better one."""
+    scores = scores.copy()
+    peaks: list[int] = []
+    while len(peaks) < thresholds.candidates:
+        best = int(np.argmax(scores))
+        if scores[best] < thresholds.least_score or scores[best] <= 0:
+            break
+        peaks.append(best)
+        scores[np.abs(indices - indices[best]) <= thresholds.candidate_spacing] = 0.0
+    return peaks
+
+
+@dataclass(frozen=True)
+class Track:
+    """Odometry ``T_world_camera`` ``(N, 4, 4)`` row by row: of the frames of a drive, or of the keyframes of its maps.
+
+    ``path`` ``(N,)`` grows by what odometry may err on. Lengths have one unit within each of ``maps`` ``(N,)``, and
+    maps that odometry relates have one of ``worlds`` ``(N,)``.
+    """
+
+    T_world_camera: FloatArray
+    path: FloatArray
+    frames: NDArray[np.intp]
+    maps: NDArray[np.intp]
+    worlds: NDArray[np.intp]
+
+    @classmethod
+    def of_drive(cls, T_world_camera: FloatArray) -> Self:
+        """Of all frames of a drive, in one unit."""
+        frames, one = np.arange(len(T_world_camera)), np.zeros(len(T_world_camera), np.intp)
+        return cls(T_world_camera, path_distance(T_world_camera), frames, one, one)
+
+    def rows(self, loops: Sequence[Loop]) -> NDArray[np.intp]:
+        """Rows of both ends of loops ``(L, 2)``."""
+        return np.searchsorted(self.frames, np.array([loop.ends for loop in loops], np.intp).reshape(-1, 2))
+
+
+def agreeing(loops: Sequence[Loop], track: Track, thresholds: LoopThresholds) -> tuple[list[Loop], list[RejectedLoop]]:
+    """Split verified loops into consistent ones, and ones without support or in conflict with others.
+
+    They are in the unit of the map of their earlier end.
+    """
+    possible: list[Loop] = []
+    kept: list[Loop] = []
+    refused: list[RejectedLoop] = []
+    for loop, (earlier, later) in zip(loops, track.rows(loops), strict=True):
+        T_earlier_later = invert(track.T_world_camera[earlier]) @ track.T_world_camera[later]
+        drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
+        length = track.path[later] - track.path[earlier]
+        if track.worlds[earlier] == track.worlds[later] and drift > thresholds.max_drift_ratio * length:
+            limit = f"{thresholds.max_drift_ratio:.0%}"
+            refused.append(loop.refused(f"corrects the odometry by more than {limit} of the path between its frames"))
+        else:
+            possible.append(loop)
+    for loop, (supporting, conflicting) in zip(possible, _votes_by_maps(possible, track, thresholds), strict=True):
+        if conflicting > supporting:
+            refused.append(loop.refused(f"contradicted by {conflicting} of {conflicting + supporting} loops nearby"))
+        elif supporting < thresholds.min_support and loop.inliers < thresholds.alone_inliers:
+            refused.append(loop.refused(f"lacks support: {supporting} loops nearby agree"))
+        else:
+            kept.append(loop)
+    return kept, refused
+
+
+def _votes_by_maps(loops: Sequence[Loop], track: Track, thresholds: LoopThresholds) -> NDArray[np.intp]:
+    """How many loops support and conflict with each loop ``(L, 2)``: loops between the same two maps, or within one."""
+    pairs, votes = track.maps[track.rows(loops)], np.zeros((len(loops), 2), np.intp)
+    for first, second in np.unique(pairs, axis=0):
+        chosen = np.flatnonzero((pairs == [first, second]).all(axis=1))
+        between, T_world_camera = [loops[k] for k in chosen], track.T_world_camera.copy()
+        if first != second:  # steps of the later map in the unit of the earlier one
+            T_world_camera[track.maps == second, :3, 3] *= np.median([loop.scale for loop in between])
+        votes[chosen] = _votes(between, track.rows(between), T_world_camera, thresholds)
+    return votes
+
+
+def _votes(
+    loops: Sequence[Loop], ends: NDArray[np.intp], T_world_camera: FloatArray, thresholds: LoopThresholds
+) -> list[tuple[int, int]]:
+    """How many loops nearby support and conflict with each loop; loops of the same image count once."""
+    T_from_to = np.array([loop.measured.T_from_to for loop in loops]).reshape(-1, 4, 4)
+    sigmas = np.array([loop.measured.sigmas for loop in loops]).reshape(-1, 6)
+    votes = []
+    for k, (earlier, later) in enumerate(ends):
+        distance = np.abs(ends - ends[k])
+        near = np.flatnonzero((distance <= thresholds.support_distance).all(axis=1) & (distance[:, 1] > 0))
+        T_earlier = invert(T_world_camera[earlier]) @ T_world_camera[ends[near, 0]]
+        T_later = invert(T_world_camera[ends[near, 1]]) @ T_world_camera[later]
+        cycle = invert(T_from_to[k]) @ T_earlier @ T_from_to[near] @ T_later
+        rotation = rotation_angle(cycle[:, :3, :3])
+        translation = np.linalg.norm(cycle[:, :3, 3], axis=1)
+        both = np.hypot(sigmas[near], sigmas[k])
+        length = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
+        drift = np.deg2rad(thresholds.support_drift_deg) * distance[near].sum(axis=1)
+        agrees = rotation < _SUPPORT_SIGMAS * both[:, 0] + drift
+        agrees &= translation < _SUPPORT_SIGMAS * both[:, 3] + _SUPPORT_DRIFT_RATIO * length
+        votes.append((len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1]))))
+    return votes

@@ -9,7 +9,7 @@ from slam.frames import Sequence, runs
 from slam.frontend.drive import DOUBLED, Drive, named
 from slam.frontend.image_gate import ImageGate
 from slam.frontend.lidar_odometry import has_scans
-from slam.frontend.scale.metric_scale import known_frames, resolve_mode
+from slam.frontend.scale import known_frames, resolve_mode
 from slam.runtime.errors import SlamError
 from slam.sequences.recording import GrowingSequence
 

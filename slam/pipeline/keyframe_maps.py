@@ -22,19 +22,16 @@ from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import LAST_STEPS, Drive
 from slam.frontend.factors import scaled_poses
-from slam.frontend.keyframes.joining import join
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.odometry import KeyframeOdometry
-from slam.frontend.keyframes.parts import parts_of
-from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.keyframes.unit import learned_unit
-from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.scale.road_plane import height_of
+from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses, learned_unit
+from slam.frontend.keyframes.submaps import join, parts_of
+from slam.frontend.scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
-from slam.graph.similarity_graph import RelativeSimilarity, optimise_similarities
-from slam.loops.closure import LoopClosures, find_loops, most_inliers_first
-from slam.loops.consistency import Track
-from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
+from slam.graph.pose_graph import RelativeSimilarity, optimise_similarities
+from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
+from slam.loops.recognition import OF_KEYFRAMES, Loop, LoopVerifier
+from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
 FrontEnd = Literal["steps", "both", "keyframes"]
@@ -147,10 +144,10 @@ class KeyframeTracking:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]
         T_before_frame = T_before_map @ invert(T_frame_map)
-        T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
+        T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points))
         return before, T_before_frame
 
-    def maps(self, drive: Drive) -> list[MapSegment]:
+    def maps(self, drive: Drive) -> list[LocalMap]:
         """All parts of maps so far, each in one unit; none of a vehicle, nor before the choice."""
         self.choose(drive)
         if self._measuring is None:
@@ -167,7 +164,7 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
     first = list(islice((motion for motion in drive.motions if motion.is_triangulated), _MOST_STEPS))
     if len(first) < _CLEAR_STEPS:
         return None
-    heights = [height for road in drive.roads if (height := height_of(road)) is not None]
+    heights = [road for road in drive.roads if not isinstance(road, Failed)]
     speeds = [motion.length_unscaled / motion.seconds for motion in first]
     is_fast = bool(heights) and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
     steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])
@@ -199,7 +196,7 @@ class MapClosure:
         return replace(self.loops, accepted=tuple(accepted))
 
 
-def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
+def close_maps(maps: Sequence[LocalMap], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
     """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
 
     The ``maps`` of one drive, in time order, stay as they are, and so do their ``poses`` where no loop is found.
@@ -225,12 +222,12 @@ def close_maps(maps: Sequence[MapSegment], poses: KeyframePoses, intrinsics: Int
 class _Rows:
     """The keyframes of all maps, row by row."""
 
-    def __init__(self, maps: Sequence[MapSegment], poses: KeyframePoses) -> None:
+    def __init__(self, maps: Sequence[LocalMap], poses: KeyframePoses) -> None:
         self.segments = maps
-        self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
-        counts = [len(segment.map.keyframes) for segment in maps]
+        self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.keyframes]
+        counts = [len(segment.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
-        self.T_map_camera = np.concatenate([segment.map.T_world_camera for segment in maps])
+        self.T_map_camera = np.concatenate([segment.T_world_camera for segment in maps])
         # where odometry has the keyframes: parts of a map are related by the motions between them
         frames = np.array([keyframe.index for keyframe in self.keyframes], np.intp)
         alone = zip(frames.tolist(), (-1 - self.maps).tolist(), strict=True)
@@ -254,13 +251,13 @@ class _Rows:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
         views = []
         for segment in self.segments:
-            settled = segment.map.parallax(segment.map.keyframes).settled[:, None]
-            views += segment.map.views(np.where(settled, segment.map.points, np.nan))
+            settled = segment.parallax(segment.keyframes).settled[:, None]
+            views += segment.views(np.where(settled, segment.points, np.nan))
         return views
 
     def apart(self) -> NDArray[np.bool_]:
         """Which keyframes share few tracks ``(K, K)``."""
-        first = np.cumsum([0, *(len(segment.map.points) for segment in self.segments)])
+        first = np.cumsum([0, *(len(segment.points) for segment in self.segments)])
         tracks = [k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)]
         of_row = np.repeat(np.arange(len(tracks)), [len(of_keyframe) for of_keyframe in tracks])
         shape = len(tracks), int(first[-1])
@@ -274,7 +271,7 @@ class _Rows:
             rows = [(earlier, later) for earlier, later in map(self.of, loops) if self.maps[earlier] != number]
             joining = [self.keyframes[earlier].index for earlier, later in rows if self.maps[later] == number]
             if joining:
-                first = segment.map.keyframes[0].index
+                first = segment.keyframes[0].index
                 events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
         return tuple(events)
 
@@ -302,7 +299,7 @@ class _Rows:
         return T, scales
 
 
-def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple[list[MapSegment], list[Loop]]:
+def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple[list[LocalMap], list[Loop]]:
     """The maps after these loops, and the loops that the adjustment contradicts."""
     count, ends = len(rows.segments), rows.maps[rows.track.rows(loops)]
     links = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -322,7 +319,7 @@ def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple
 
 def _joined(
     rows: _Rows, loops: Sequence[Loop], members: NDArray[np.intp], intrinsics: Intrinsics
-) -> tuple[MapSegment, list[float]]:
+) -> tuple[LocalMap, list[float]]:
     T, scales = rows.start(loops, members)
     chosen = np.flatnonzero(np.isin(rows.maps, members))
     place = np.full(len(rows.keyframes), -1)

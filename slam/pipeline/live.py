@@ -17,14 +17,14 @@ from erfsfm.common.readers.camera_file import HIGHEST_M, impossible
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
+from slam.frontend.completion import complete_drive
 from slam.frontend.drive import LAST_STEPS, frame_support
 from slam.frontend.factors import chain_odometry, make_factors
-from slam.frontend.gap_interpolation import complete_drive
-from slam.frontend.scale.metric_scale import Scale, find_scale, resolve_mode
+from slam.frontend.scale import Scale, find_scale, resolve_mode
 from slam.geometry.se3 import FloatArray, apply, compose, invert
 from slam.loops.closure import LoopClosures
 from slam.loops.places import PlaceStructure
-from slam.loops.verification import OF_KEYFRAMES
+from slam.loops.recognition import OF_KEYFRAMES
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import Recorder, SlamPipeline

@@ -17,13 +17,12 @@ from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, resized_mask
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.scale.road_homography import RoadHomography, RoadStep
-from slam.frontend.scale.road_plane import GroundPlaneFitter, height_of
+from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep
 from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
-from slam.loops.descriptors import FeatureExtractor
+from slam.loops.recognition import FeatureExtractor
 from slam.pipeline.keyframe_maps import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.resources import SpillFile, Stopwatch, return_freed_memory
@@ -190,7 +189,7 @@ class Observer:
         has_moved = False  # whether as many more steps as this one leave what the last predicted depth shows
         if step is not None:
             roads = drive.roads[: step.ends[1] + 1][-_LAST_ROADS:]
-            height = next((height for road in reversed(roads) if (height := height_of(road)) is not None), math.inf)
+            height = next((road for road in reversed(roads) if not isinstance(road, Failed)), math.inf)
             way = (index + 1 - self._depth_index) * step.length_unscaled
             has_moved = way > _MOVED_ON_HEIGHTS * height
         after_frozen = drive.repeated[-1:] == [index - 1]  # what it hid is not carried
@@ -289,7 +288,7 @@ class Observer:
         with self._stopwatch.stage("road"):
             self.drive.roads[frame.index] = road = self._plane.fit(depth, error)
         self.keyframes.learn(frame, depth)
-        current.depth, current.height = depth, height_of(road)
+        current.depth, current.height = depth, None if isinstance(road, Failed) else road
         views, loops = self.drive.views, self._config.loops
         if loops.enabled and (not views or frame.index - views[-1].index >= _LOOP_STRIDE):
             with self._stopwatch.stage("loops"):
@@ -310,7 +309,8 @@ class Observer:
             self._keep_for_map(recent.frame, recent.depth)
             return recent.depth
         recent.depth = self._predict(recent.frame).result()
-        recent.height = height_of(self._plane.fit(recent.depth, self._odometry.depth_error))
+        road = self._plane.fit(recent.depth, self._odometry.depth_error)
+        recent.height = None if isinstance(road, Failed) else road
         return recent.depth
 
     def _step(self, previous: FrameInWork | None, current: FrameInWork) -> Motion | None:

@@ -16,18 +16,17 @@ from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame, Predictor, RelativePose
+from slam.frames import Frame, GpsTrack, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
+from slam.frontend.completion import complete_drive
 from slam.frontend.drive import Drive
-from slam.frontend.factors import chain_odometry, make_factors
-from slam.frontend.gap_interpolation import complete_drive
+from slam.frontend.factors import chain_odometry, chain_raw, make_factors
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
-from slam.frontend.network_factors import chain_raw
-from slam.frontend.scale.metric_scale import (
+from slam.frontend.scale import (
     Scale,
     ScaleEstimate,
     find_scale,
@@ -37,7 +36,6 @@ from slam.frontend.scale.metric_scale import (
     scale_from_reference,
 )
 from slam.frontend.visual.motion import triangulated
-from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops

@@ -239,7 +239,7 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
     if not drive.maps:
         return Failed("this drive has no map of keyframes: it is measured from step to step")
     return records.TrackingMetrics(
-        keyframes=sum(len(segment.map.keyframes) for segment in drive.maps),
+        keyframes=sum(len(segment.keyframes) for segment in drive.maps),
         maps=len(set(drive.map_poses.component.values())),
         located_frames=len(drive.map_poses.segments),
         events=[records.Event(**asdict(event)) for event in drive.events],

@@ -20,9 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
 from slam.formats.trajectory import BadRows, in_seconds, other_unit, read_trajectory, text_of
-from slam.frames import runs
+from slam.frames import GpsTrack, runs
 from slam.geometry import se3
-from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 

@@ -7,7 +7,7 @@ window and sparse for all keyframes of a map, the points follow. A camera is per
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from slam.frames import Intrinsics
-from slam.geometry.resection import LEAST_DEPTH, PIXEL_SIGMA, pixel_jacobian
+from slam.geometry.multiview import LEAST_DEPTH, PIXEL_SIGMA, pixel_jacobian
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, compose, from_rotation_vector
 
@@ -32,6 +32,7 @@ _MOST_DENSE = 150  # cameras: each of more shares points with few others only
 _SIX = np.arange(6)
 
 Part = tuple[NDArray[np.int64], FloatArray]
+_StepByDamping = Callable[[float], tuple[FloatArray, FloatArray] | None]
 
 
 @dataclass(frozen=True)
@@ -103,10 +104,10 @@ class BundleAdjustment:
         residuals = self.residuals(T, X)
         cost = self._cost(residuals)
         damping = _FIRST_DAMPING
-        system = None
+        step_by = None
         for _ in range(iterations):
-            system = system or _System.of(self, T, X, residuals)
-            step = system.step(damping)
+            step_by = step_by or self._normal_equations(T, X, residuals)
+            step = step_by(damping)
             before = cost
             if step is not None:
                 by_camera, by_point = step
@@ -116,7 +117,7 @@ class BundleAdjustment:
                 residuals_new = self.residuals(T_new, X_new)
                 cost_new = self._cost(residuals_new)
                 if cost_new <= cost:
-                    T, X, residuals, cost, system = T_new, X_new, residuals_new, cost_new, None
+                    T, X, residuals, cost, step_by = T_new, X_new, residuals_new, cost_new, None
                     damping = max(0.1 * damping, _LEAST_DAMPING)
                     if before - cost <= tolerance * before:
                         break
@@ -188,6 +189,55 @@ class BundleAdjustment:
         root = np.sqrt(np.minimum(self._huber / np.maximum(length, 1e-12), 1.0))
         return np.asarray(root[:, [0, 0, 1]])
 
+    def _normal_equations(self, T: FloatArray, X: FloatArray, residuals: FloatArray) -> _StepByDamping:
+        """Steps of cameras ``(F, 6)`` and points ``(P, 3)`` by the damping, None where the system is singular.
+
+        Its parts are those of cameras ``U`` ``(F, 6, 6)`` and points ``V`` ``(P, 3, 3)``, their coupling ``W``
+        ``(6, 3, S)``, and the right sides.
+        """
+        root = self.weights(residuals)
+        A, B = (root.T * J for J in self.jacobians(T, X))
+        r = (root * residuals).T
+        of_cameras = [
+            (A[..., rows].reshape(6, -1), r[:, rows].ravel())
+            for rows, is_free in zip(self._rows, self._free, strict=True)
+            if is_free
+        ]
+        point, points = self._seen.point, self._points
+        V, point_side = np.empty((points, 3, 3)), np.empty((points, 3))
+        for i in range(3):
+            point_side[:, i] = -np.bincount(point, (B[i] * r).sum(axis=0), points)
+            for j in range(i + 1):
+                V[:, i, j] = V[:, j, i] = np.bincount(point, (B[i] * B[j]).sum(axis=0), points)
+        W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1] + A[:, None, 2] * B[:, 2]
+        U = np.array([J @ J.T for J, _ in of_cameras])
+        camera_side = np.array([-J @ residual for J, residual in of_cameras])
+
+        def step(damping: float) -> tuple[FloatArray, FloatArray] | None:
+            V_inverse = np.asarray(np.linalg.inv(_damped(V, damping)), np.float64)
+            # the cameras' system without the points, as a sum of parts
+            side, by_point = camera_side.copy(), point_side.copy()
+            parts = [(np.array([k]), own) for k, own in enumerate(_damped(U, damping))]
+            coupled = []
+            for block in self._blocks:
+                coupling = W[..., block.sightings]
+                inverse = np.ascontiguousarray(V_inverse[block.points[block.local_point]].transpose(1, 2, 0))
+                # row by row: products of small matrices one by one take ten times as long
+                with_points = sum(coupling[:, i, None] * inverse[i] for i in range(3))
+                W_block, WV = (block.dense(part) for part in (coupling, with_points))
+                # cameras of a block are few, so that the product is small
+                parts.append((block.cameras, -(WV @ W_block.T)))
+                side[block.cameras] -= (WV @ point_side[block.points].ravel()).reshape(-1, 6)
+                coupled.append((block, W_block))
+            by_camera = solve_sum(parts, side)
+            if by_camera is None:
+                return None
+            for block, W_block in coupled:
+                by_point[block.points] -= (by_camera[block.cameras].ravel() @ W_block).reshape(-1, 3)
+            return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
+
+        return step
+
     def _eliminated_together(self) -> list[_Block]:
         """Points in the order of the first camera that sees them, in blocks that share few cameras."""
         camera, point = self._column[self._seen.camera], self._seen.point
@@ -227,62 +277,6 @@ class _Block:
         return matrix.reshape(6 * len(self.cameras), 3 * len(self.points))
 
 
-@dataclass(frozen=True)
-class _System:
-    """Normal equations: cameras ``U`` ``(F, 6, 6)``, points ``V`` ``(P, 3, 3)``, their coupling, right sides."""
-
-    blocks: Sequence[_Block]
-    U: FloatArray
-    V: FloatArray
-    W: FloatArray  # (6, 3, S)
-    camera_side: FloatArray
-    point_side: FloatArray
-
-    @classmethod
-    def of(cls, problem: BundleAdjustment, T: FloatArray, X: FloatArray, residuals: FloatArray) -> _System:
-        root = problem.weights(residuals)
-        A, B = (root.T * J for J in problem.jacobians(T, X))
-        r = (root * residuals).T
-        of_cameras = [
-            (A[..., rows].reshape(6, -1), r[:, rows].ravel())
-            for rows, is_free in zip(problem._rows, problem._free, strict=True)
-            if is_free
-        ]
-        point, points = problem._seen.point, problem._points
-        V, point_side = np.empty((points, 3, 3)), np.empty((points, 3))
-        for i in range(3):
-            point_side[:, i] = -np.bincount(point, (B[i] * r).sum(axis=0), points)
-            for j in range(i + 1):
-                V[:, i, j] = V[:, j, i] = np.bincount(point, (B[i] * B[j]).sum(axis=0), points)
-        W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1] + A[:, None, 2] * B[:, 2]
-        U = np.array([J @ J.T for J, _ in of_cameras])
-        camera_side = np.array([-J @ residual for J, residual in of_cameras])
-        return cls(problem._blocks, U, V, W, camera_side, point_side)
-
-    def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
-        """Steps of cameras ``(F, 6)`` and points ``(P, 3)``; None where the system is singular."""
-        V_inverse = np.asarray(np.linalg.inv(_damped(self.V, damping)), np.float64)
-        # the cameras' system without the points, as a sum of parts
-        side, by_point = self.camera_side.copy(), self.point_side.copy()
-        parts = [(np.array([k]), own) for k, own in enumerate(_damped(self.U, damping))]
-        coupled = []
-        for block in self.blocks:
-            coupling = self.W[..., block.sightings]
-            inverse = np.ascontiguousarray(V_inverse[block.points[block.local_point]].transpose(1, 2, 0))
-            # row by row: products of small matrices one by one take ten times as long
-            W, WV = (block.dense(part) for part in (coupling, sum(coupling[:, i, None] * inverse[i] for i in range(3))))
-            # cameras of a block are few, so that the product is small
-            parts.append((block.cameras, -(WV @ W.T)))
-            side[block.cameras] -= (WV @ self.point_side[block.points].ravel()).reshape(-1, 6)
-            coupled.append((block, W))
-        by_camera = solve_sum(parts, side)
-        if by_camera is None:
-            return None
-        for block, W in coupled:
-            by_point[block.points] -= (by_camera[block.cameras].ravel() @ W).reshape(-1, 3)
-        return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
-
-
 def _damped(blocks: FloatArray, damping: float) -> FloatArray:
     diagonal = np.einsum("kii->ki", blocks)
     added = damping * np.maximum(diagonal, 1e-6) + 1e-12
@@ -299,30 +293,19 @@ def solve_sum(parts: Sequence[Part], side: FloatArray) -> FloatArray | None:
     Returns:
         ``(F, 6)``, or None where the sum is singular.
     """
-    unknowns = [(6 * cameras[:, None] + _SIX).ravel() for cameras, _ in parts]
-    solve = _dense if len(side) <= _MOST_DENSE else _sparse
-    solution = solve(unknowns, [part for _, part in parts], side.ravel())
-    return None if solution is None else solution.reshape(-1, 6)
-
-
-def _dense(unknowns: Sequence[NDArray[np.int64]], parts: Sequence[FloatArray], side: FloatArray) -> FloatArray | None:
-    S = np.zeros((len(side), len(side)))
-    for rows, part in zip(unknowns, parts, strict=True):
-        S[np.ix_(rows, rows)] += part
+    unknowns, right = [(6 * cameras[:, None] + _SIX).ravel() for cameras, _ in parts], side.ravel()
     try:
-        return np.asarray(cho_solve(cho_factor(S, check_finite=False), side, check_finite=False))
-    except LinAlgError:
-        return None
-
-
-def _sparse(unknowns: Sequence[NDArray[np.int64]], parts: Sequence[FloatArray], side: FloatArray) -> FloatArray | None:
-    rows = np.concatenate([np.repeat(each, len(each)) for each in unknowns])
-    columns = np.concatenate([np.tile(each, len(each)) for each in unknowns])
-    values = np.concatenate([part.ravel() for part in parts])
-    S = csc_array((values, (rows, columns)), shape=(len(side), len(side)))
-    try:
+        if len(side) <= _MOST_DENSE:
+            S = np.zeros((len(right), len(right)))
+            for rows, (_, part) in zip(unknowns, parts, strict=True):
+                S[np.ix_(rows, rows)] += part
+            return np.asarray(cho_solve(cho_factor(S, check_finite=False), right, check_finite=False)).reshape(-1, 6)
+        of_rows = np.concatenate([np.repeat(each, len(each)) for each in unknowns])
+        columns = np.concatenate([np.tile(each, len(each)) for each in unknowns])
+        values = np.concatenate([part.ravel() for _, part in parts])
+        system = csc_array((values, (of_rows, columns)), shape=(len(right), len(right)))
         # as a symmetric one: its pattern decides the order, and pivots stay on the diagonal
-        factors = splu(S, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    except RuntimeError:
+        factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except (LinAlgError, RuntimeError):
         return None
-    return np.asarray(factors.solve(side))
+    return np.asarray(factors.solve(right)).reshape(-1, 6)

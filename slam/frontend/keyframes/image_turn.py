@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import Grey, Intrinsics, slopes_of
 from slam.frontend.tracking import Pixels
-from slam.geometry.epipolar import rotation_between
+from slam.geometry.multiview import rotation_between
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix
 
 _REDUCED = 8  # an image over the small one

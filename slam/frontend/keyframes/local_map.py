@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, View, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
-from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, track
-from slam.geometry.resection import PIXEL_SIGMA
+from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, track
+from slam.geometry.multiview import PIXEL_SIGMA
 from slam.geometry.robust import weighted_median
 from slam.geometry.se3 import FloatArray, apply, invert
 
@@ -26,7 +26,7 @@ TrackIds = NDArray[np.int64]
 
 _IMAGES_KEPT = 20
 _LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
-_MATCHED = OF_KEYFRAMES._replace(levels=1)  # guesses are near
+_MATCHED = KEYFRAME_SEARCH._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
 _SHARED = 5
@@ -136,14 +136,22 @@ class TrackedKeyframe:
 
 @dataclass
 class LocalMap:
-    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where unknown."""
+    """One map, from its first keyframe to a loss; ``started`` once it has points.
+
+    ``keyframes`` and ``frames`` are in time order, ``points`` ``(N, 3)`` in the world by track, NaN where unknown.
+    ``turns`` are motions of the camera where no point carries the unit, in the unit of learned depth.
+    """
 
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    frames: list[TrackedFrame] = field(default_factory=list)
+    started: bool = False
+    turns: list[RelativePose] = field(default_factory=list)
 
     def copy(self) -> LocalMap:
         """A snapshot, which stays while this map grows."""
-        return LocalMap(self.keyframes.copy(), self.points.copy())
+        own = self.keyframes.copy(), self.points.copy(), self.frames.copy(), self.started, self.turns.copy()
+        return LocalMap(*own)
 
     @property
     def T_world_camera(self) -> FloatArray:
@@ -336,23 +344,6 @@ class TrackedFrame:
     track_ids: TrackIds
     pixels: Pixels
     T_camera_world: FloatArray | None
-
-
-@dataclass
-class MapSegment:
-    """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points.
-
-    ``turns`` are motions of the camera where no point carries the unit, in the unit of learned depth.
-    """
-
-    map: LocalMap = field(default_factory=LocalMap)
-    frames: list[TrackedFrame] = field(default_factory=list)
-    started: bool = False
-    turns: list[RelativePose] = field(default_factory=list)
-
-    def copy(self) -> MapSegment:
-        """A snapshot, which stays while this map grows."""
-        return replace(self, map=self.map.copy(), frames=self.frames.copy(), turns=self.turns.copy())
 
 
 class NewImage:

@@ -2,7 +2,13 @@
 
 As in PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015), with optical flow in place of descriptors. At
 30 frames a second the parallax of neighbouring frames is a pixel; geometry over longer baselines needs tracks that do
-not drift, so each corner is compared with its image in the keyframe, not with that in the frame before.
+not drift, so each corner is compared with its image in the keyframe, not with that in the frame before. A lost camera
+is found again among the keyframes of its map, by corners that match those with points.
+
+A scene without relief fits a motion and its reverse alike, with near and far exchanged. From learned depth alone the
+adjustment may end in the wrong one, and from there no later keyframe leads back. So the first motion with parallax,
+where points have nothing but learned depth, also starts from motions by essential matrix and homographies (Faugeras
+and Lustman 1988), and what fits best is taken.
 """
 
 from __future__ import annotations
@@ -13,9 +19,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent, View
-from slam.frontend.keyframes.first_motion import first_motion
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
 from slam.frontend.keyframes.image_turn import (
     ImageTurn,
     SmallImage,
@@ -26,13 +33,28 @@ from slam.frontend.keyframes.image_turn import (
     small_image,
     turned,
 )
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
-from slam.frontend.keyframes.relocalisation import Relocaliser
-from slam.frontend.tracking import OF_KEYFRAMES, Pixels, are_inside, new_corners, track
-from slam.geometry.epipolar import parallax_px
-from slam.geometry.resection import INLIER_PX, MIN_POINTS, Resection, resect
+from slam.frontend.keyframes.local_map import (
+    DEPTH_SIGMA,
+    LocalMap,
+    NewImage,
+    TrackedFrame,
+    TrackedKeyframe,
+    TrackIds,
+)
+from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
+from slam.frontend.visual.two_view import CORNER_CORRELATION
+from slam.geometry.multiview import (
+    INLIER_PX,
+    MIN_POINTS,
+    Resection,
+    parallax_px,
+    resect,
+    triangulated_depth,
+    unit_pose_by_essential,
+    unit_poses_by_homography,
+)
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.descriptors import describe
+from slam.loops.recognition import OF_KEYFRAMES, LoopVerifier, PlaceIndex, Sighting, describe, matches
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +72,12 @@ _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _MAX_CORNERS = 500  # of a keyframe
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+_PLACES_TRIED = 6
+# a single image has no points of its own that would confirm the pose, so it takes twice those of a loop
+_LEAST_CONFIRMING = 30
+_FIRST_INLIER_PX = 1.0
+_FIRST_LIMITS = 30, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
+_GAIN = 0.5 * (3.0 * CORNER_CORRELATION) ** 2  # of the cost: three sigmas, of corners whose errors are correlated
 
 
 class KeyframeOdometry:
@@ -73,7 +101,7 @@ class KeyframeOdometry:
         self._intrinsics = intrinsics
         self._seed = seed
         self._on_keyframe = on_keyframe
-        self.segments: list[MapSegment] = []
+        self.segments: list[LocalMap] = []
         self._places: Pixels = np.zeros((0, 2), np.float32)  # of the keyframe's corners
         self._slipped: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._T_camera_world = self._T_last_step = np.eye(4)
@@ -92,17 +120,12 @@ class KeyframeOdometry:
         last keyframe has been learned, if it has any.
         """
         self._follow(frame)
-        lost = self._lost_map() if self._relocalises else None
-        if lost is None:
-            self._relocaliser = None
+        started = [segment for segment in self.segments if segment.started]
+        # until the camera is found again in the map in which it was lost, or another map has points
+        if self._relocalises and started and (self._lost > 0 or not self.segments[-1].started):
+            self._relocalise(started[-1], frame)
         else:
-            self._relocalise(lost, frame)
-
-    def _lost_map(self) -> LocalMap | None:
-        """The map in which the camera was lost, until it is found again or another map has points."""
-        started = [segment.map for segment in self.segments if segment.started]
-        is_lost = bool(started) and (self._lost > 0 or not self.segments[-1].started)
-        return started[-1] if is_lost else None
+            self._relocaliser = None
 
     def _relocalise(self, lost: LocalMap, frame: Frame) -> None:
         """Look for the camera in the lost map; where it is found, the map goes on with this frame as a keyframe."""
@@ -125,7 +148,7 @@ class KeyframeOdometry:
         self._T_camera_world, self._T_last_step, self._lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
         pixels = in_middle_row(pixels, self._turn_rate, self._intrinsics)
-        segment.frames.append(self._tracked(frame, track_ids, pixels))
+        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
 
     def _follow(self, frame: Frame) -> None:
         before, self._small = self._small, small_image(frame.grey)
@@ -139,7 +162,10 @@ class KeyframeOdometry:
             return
         segment = self.segments[-1]
         track_ids, pixels = self._track(segment, frame, turn)
-        self._measure_turn(segment, track_ids, pixels, since)
+        if self._intrinsics.readout_s:  # how fast the camera turns, for a rolling shutter
+            last = segment.frames[-1] if segment.frames else segment.keyframes[-1]
+            _, a, b = np.intersect1d(last.track_ids, track_ids, assume_unique=True, return_indices=True)
+            self._turn_rate = measured_turn(last.pixels[a], pixels[b], since, self._turn_rate, self._intrinsics)
         if self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
@@ -147,7 +173,7 @@ class KeyframeOdometry:
         if turn.correlation > _SURE_CORRELATION and not self._lost:
             self._T_camera_world = compose(self._T_last_step, self._T_camera_world)
             self._add_keyframe(segment, frame, *_NOTHING)
-            segment.frames.append(self._tracked(frame, *_NOTHING))
+            segment.frames.append(TrackedFrame(frame.index, *_NOTHING, self._T_camera_world))
             return
         self._lost += 1
         segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
@@ -157,17 +183,16 @@ class KeyframeOdometry:
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned z-depth ``(H, W)`` of the frame that was followed last, which gives points where it is a keyframe."""
         segment = self.segments[-1]
-        local = segment.map
-        if local.keyframes[-1].index != frame.index:
+        if segment.keyframes[-1].index != frame.index:
             return
-        local.keyframes[-1] = local.keyframes[-1].with_depth(depth)
-        local.add_points(self._intrinsics)
+        segment.keyframes[-1] = segment.keyframes[-1].with_depth(depth)
+        segment.add_points(self._intrinsics)
         self._spread = None
-        points = int(local.known(local.keyframes[-1].track_ids).sum())
+        points = int(segment.known(segment.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
             for before in self.segments[:-1]:  # no keyframe will be added to them
-                before.map.keyframes = [replace(keyframe, grey=None) for keyframe in before.map.keyframes]
+                before.keyframes = [replace(keyframe, grey=None) for keyframe in before.keyframes]
             self._note(frame.index, "map begun", support=points)
 
     def locates(self, first: int, last: int) -> bool:
@@ -180,13 +205,13 @@ class KeyframeOdometry:
         """A new map whose first keyframe is this frame."""
         if self._lost:
             self._note(self.segments[-1].frames[-self._lost].index, "lost")
-        self.segments.append(MapSegment())
+        self.segments.append(LocalMap())
         self._T_camera_world, self._lost = np.eye(4), 0
         self._add_keyframe(self.segments[-1], frame, *_NOTHING)
 
-    def _track(self, segment: MapSegment, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
+    def _track(self, segment: LocalMap, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a turn."""
-        keyframe = segment.map.keyframes[-1]
+        keyframe = segment.keyframes[-1]
         rows = np.flatnonzero(~self._slipped)
         if keyframe.grey is None or not len(rows):
             return _NOTHING
@@ -194,15 +219,15 @@ class KeyframeOdometry:
         if turn is not None and turn.correlation > _LEAST_CORRELATION:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
         corners = keyframe.places[rows].astype(np.float32)
-        tracked, kept = track(keyframe.grey, frame.grey, corners, OF_KEYFRAMES, guesses)
+        tracked, kept = track(keyframe.grey, frame.grey, corners, KEYFRAME_SEARCH, guesses)
         kept &= are_inside(tracked, frame.grey.shape)
         shift = np.median(tracked[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]
 
-    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
+    def _locate(self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
         """The camera's pose from known points; whether there are enough."""
-        known = segment.map.known(track_ids)
+        known = segment.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
         pose = self._resected(segment, track_ids[known], pixels[known])
         if pose is None:
@@ -211,10 +236,10 @@ class KeyframeOdometry:
         before, self._T_camera_world = self._T_camera_world, pose.T_camera_world
         self._T_last_step = self._T_camera_world @ invert(before)
         slipped = track_ids[known][pose.residual_px > _SLIPPED * INLIER_PX]
-        self._slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
+        self._slipped |= np.isin(segment.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
         track_ids, places, pixels = track_ids[kept], places[kept], pixels[kept]
-        last, is_young = segment.map.keyframes[-1], len(segment.map.keyframes) < _YOUNG_KEYFRAMES
+        last, is_young = segment.keyframes[-1], len(segment.keyframes) < _YOUNG_KEYFRAMES
         parallax, flow = self._moved_since(last, track_ids, pixels)
         limit = _YOUNG_PARALLAX_RATIO if is_young else _PARALLAX_RATIO
         are_few = len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS)
@@ -222,39 +247,39 @@ class KeyframeOdometry:
             if parallax > _YOUNG_PARALLAX_RATIO:
                 self._check_first_motion(segment, track_ids, pixels)
             self._add_keyframe(segment, frame, track_ids, places)
-        segment.frames.append(self._tracked(frame, track_ids, pixels))
+        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
         return True
 
-    def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
+    def _resected(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
         """From the last pose and from the predicted one; None with too few inliers."""
         if len(track_ids) < MIN_POINTS:
             return None
         T_last = self._T_camera_world
         guesses = T_last, self._T_last_step @ T_last
-        points = segment.map.points[track_ids]
+        points = segment.points[track_ids]
         if self._spread is None:
-            self._spread = segment.map.spread(self._intrinsics)
-        spread = self._spread[np.searchsorted(segment.map.keyframes[-1].track_ids, track_ids)]
+            self._spread = segment.spread(self._intrinsics)
+        spread = self._spread[np.searchsorted(segment.keyframes[-1].track_ids, track_ids)]
         before = np.isin(track_ids, segment.frames[-1].track_ids) if segment.frames else np.zeros(0, np.bool_)
         trusted = before if before.sum() >= MIN_POINTS else None
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics.K, self._seed, spread, trusted)
         return pose if len(pose.inliers) >= MIN_POINTS else None
 
-    def _check_first_motion(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _check_first_motion(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> None:
         """The best motion since the last keyframe, and its points, where these had no parallax before."""
-        local, before = segment.map, segment.map.keyframes[-1]
+        before = segment.keyframes[-1]
         rows = np.searchsorted(before.track_ids, track_ids)
-        known = local.known(track_ids)
-        settled = local.parallax(local.keyframes[-_LOOKED_BACK:]).settled[track_ids]
+        known = segment.known(track_ids)
+        settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
         if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
         tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
-        depth = apply(before.T_camera_world, local.points[tracks])[:, 2]
+        depth = apply(before.T_camera_world, segment.points[tracks])[:, 2]
         T = self._T_camera_world @ invert(before.T_camera_world)
         T_now_before, depth = first_motion(T, pixels_before, now, depth, self._intrinsics, self._seed)
         self._T_camera_world = T_now_before @ before.T_camera_world
         points = self._intrinsics.rays(pixels_before) * depth[:, None]
-        local.points[tracks] = apply(invert(before.T_camera_world), points)
+        segment.points[tracks] = apply(invert(before.T_camera_world), points)
 
     def _moved_since(self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> tuple[float, float]:
         """Median parallax, and median shift, of corners ``(M, 2)`` since a keyframe, over the width of the image."""
@@ -265,44 +290,123 @@ class KeyframeOdometry:
         shift = np.linalg.norm(pixels - before, axis=1)
         return float(np.median(parallax)) / intrinsics.width, float(np.median(shift)) / intrinsics.width
 
-    def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _add_keyframe(self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""
         self._on_keyframe(frame)
-        intrinsics, local = self._intrinsics, segment.map
+        intrinsics = self._intrinsics
         T, is_tracked = self._T_camera_world, len(track_ids) > 0
         if is_tracked:
             image = NewImage(frame.grey, T, intrinsics)
-            pixels = local.aligned(image, track_ids, pixels)
-            again, reprojected = local.found_again(image, track_ids)
+            pixels = segment.aligned(image, track_ids, pixels)
+            again, reprojected = segment.found_again(image, track_ids)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, _MAX_CORNERS - len(pixels))
-        track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
+        track_ids = np.concatenate([track_ids, segment.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)
         track_ids, places = track_ids[order], pixels[order].astype(np.float64)
         unknown = np.full(len(track_ids), np.nan)
         middle, descriptors = in_middle_row(places, self._turn_rate, intrinsics), describe(frame.grey, places)
-        local.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
+        segment.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
         if is_tracked:
-            gone = local.adjust(intrinsics)
-            local.keyframes[-1] = local.keyframes[-1].without(gone)
-            self._T_camera_world = local.keyframes[-1].T_camera_world
-        self._places = local.keyframes[-1].places.astype(np.float32)
+            gone = segment.adjust(intrinsics)
+            segment.keyframes[-1] = segment.keyframes[-1].without(gone)
+            self._T_camera_world = segment.keyframes[-1].T_camera_world
+        self._places = segment.keyframes[-1].places.astype(np.float32)
         self._slipped = np.zeros(len(self._places), np.bool_)
         self._spread = None
-
-    def _measure_turn(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels, seconds: float) -> None:
-        """How fast the camera turns, for a rolling shutter."""
-        if not self._intrinsics.readout_s:
-            return
-        before = segment.frames[-1] if segment.frames else segment.map.keyframes[-1]
-        _, a, b = np.intersect1d(before.track_ids, track_ids, assume_unique=True, return_indices=True)
-        self._turn_rate = measured_turn(before.pixels[a], pixels[b], seconds, self._turn_rate, self._intrinsics)
 
     def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
         """Keep an event and log it."""
         self.events.append(TrackingEvent(frame, event, other, support))
         logger.info("%s", self.events[-1])
 
-    def _tracked(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
-        return TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world)
+
+class Relocaliser:
+    """Finds single images among the keyframes of one map."""
+
+    def __init__(self, local: LocalMap, intrinsics: Intrinsics, seed: int = 0) -> None:
+        """Index the keyframes of the map, at least one; ``seed`` is that of RANSAC."""
+        self.local, self._intrinsics = local, intrinsics
+        self._views, self._T_map_camera = local.views(local.points), local.T_world_camera
+        self._index = PlaceIndex(self._views)
+        self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
+
+    def locate(self, image: View) -> tuple[FloatArray, TrackIds, Pixels, int] | None:
+        """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few.
+
+        Returns:
+            ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)`` where the image sees
+            them, and the frame of the keyframe with most of them.
+        """
+        # keyframes (M,), rows of their corners and of the image's (M, 2), and points in the map (M, 3)
+        parts = [(np.zeros(0, np.intp), np.zeros((0, 2), np.intp), np.zeros((0, 3)))]
+        for keyframe in self._index.nearest(image, _PLACES_TRIED):
+            view = self._views[keyframe]
+            pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
+            pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
+            in_map = apply(self._T_map_camera[keyframe], view.points[pairs[:, 0]].astype(np.float64))
+            parts.append((np.full(len(pairs), keyframe), pairs, in_map))
+        keyframes, rows, points = (np.concatenate(column) for column in zip(*parts, strict=True))
+        best: Sighting | None = None
+        for keyframe in np.unique(keyframes):
+            here = keyframes == keyframe
+            seen = self._verifier.resect(points[here].astype(np.float32), image.pixels[rows[here, 1]])
+            if isinstance(seen, Sighting) and (best is None or len(seen.inliers) > len(best.inliers)):
+                best = seen
+        if best is None:
+            return None
+        X = apply(best.T_camera_points, points)
+        ahead = X[:, 2] > 0
+        X[~ahead, 2] = 1.0
+        residual = np.linalg.norm(self._intrinsics.project(X) - image.pixels[rows[:, 1]], axis=1)
+        kept = np.flatnonzero(ahead & (residual < OF_KEYFRAMES.reprojection_px))
+        _, first = np.unique(rows[kept, 1], return_index=True)
+        kept = kept[first]
+        if len(kept) < _LEAST_CONFIRMING:
+            return None
+        seen_by = zip(keyframes[kept].tolist(), rows[kept, 0].tolist(), strict=True)
+        tracks = np.array([self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by])
+        tracks, once = np.unique(tracks, return_index=True)
+        place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
+        return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
+
+
+def first_motion(
+    T_now_before: FloatArray,
+    pixels_before: FloatArray,
+    pixels: FloatArray,
+    depth: FloatArray,
+    intrinsics: Intrinsics,
+    seed: int = 0,
+) -> tuple[FloatArray, FloatArray]:
+    """``T_now_before`` of two views, and the depth in the first one ``(M,)``, in the unit of a prior.
+
+    From corners at ``pixels_before`` and ``pixels`` ``(M, 2)`` with ``depth`` ``(M,)`` in the first view by the prior.
+    """
+    rays_before, rays = intrinsics.rays(pixels_before), intrinsics.rays(pixels)
+    tolerance = _FIRST_INLIER_PX / intrinsics.fx
+    by_essential = unit_pose_by_essential(rays_before, rays, tolerance, seed)
+    motions = [] if by_essential is None else [by_essential]
+    starts = [(T_now_before, depth)]
+    for motion in motions + unit_poses_by_homography(rays_before, rays, tolerance, seed):
+        triangulated = triangulated_depth(rays_before, rays, motion)
+        ahead = triangulated > 0.0
+        if ahead.any():
+            unit = float(np.median(depth[ahead] / triangulated[ahead]))
+            at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
+            R = Rotation.from_matrix(motion.R_current_previous).as_matrix()  # OpenCV's are less exact
+            starts.append((make(R, unit * motion.direction), at))
+    rows = np.arange(len(pixels))
+    sightings = Sightings(
+        np.repeat([0, 1], len(rows)),
+        np.tile(rows, 2),
+        np.concatenate([pixels_before, pixels]),
+        np.concatenate([depth, np.full(len(rows), np.nan)]),
+        np.full(2 * len(rows), DEPTH_SIGMA),
+    )
+    problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]))
+    solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_FIRST_LIMITS) for T, z in starts]
+    costs = np.array([adjusted.cost for adjusted in solved])
+    best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
+    return best.T_camera_world[1], best.points[:, 2]

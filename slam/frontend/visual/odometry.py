@@ -2,12 +2,17 @@
 
 As in DF-VO (Zhan et al. 2020): an essential matrix where the parallax determines one, its length from the
 ratio of learned to triangulated depth; perspective-n-point against learned depth where it does not.
+
+Learned depth, the dynamic mask and the motion prior are learned from the steps before: one wrong step teaches them to
+find the next one wrong too. So a step that loses a third of its inliers, or has a length that no car reaches, is
+estimated again from corners alone, and the road, the steps before and a car's acceleration vote between both.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,31 +30,29 @@ from slam.frames import (
     resized_depth,
     trusted_depth,
 )
-from slam.frontend.tracking import CornerTracker, Tracks
-from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.focal_length import FocalLength
+from slam.frontend.tracking import CornerTracker, PredictedFlow, Tracks
 from slam.frontend.visual.motion import Motion, MotionHistory, RelativeRotation, pose_sigmas
-from slam.frontend.visual.moving_regions import DynamicMask
-from slam.frontend.visual.predicted_flow import PredictedFlow
-from slam.frontend.visual.step_check import Step, TriangulatedPoints, most_credible
+from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
     DEPTH_RELATIVE_SIGMA,
     INLIER_PX,
+    DynamicMask,
     Matches,
     TwoViewEstimate,
     estimate,
     refined,
 )
-from slam.geometry.epipolar import (
+from slam.geometry.multiview import (
+    consensus,
     depth_in_current,
     parallax_px,
+    resect,
     rotation_between,
     triangulated_depth,
     triangulated_nearness,
 )
-from slam.geometry.resection import consensus, resect
-from slam.geometry.robust import MAD_TO_SIGMA
+from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray, invert, make
 from slam.runtime.errors import Failed
 
@@ -76,6 +79,10 @@ _ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
 # less contrast, corners crowd on few objects, and the time grows with them
 _MOST_PIXELS = 1e6
 _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degrees
+# largest log of a length over the same by the road or by triangulated points
+_AGREEMENT = 0.25
+_LEAST_ROAD_CORNERS = 8
+_LEAST_COMMON = 12  # points by which two steps compare their lengths
 
 
 class VisualOdometry:
@@ -122,14 +129,19 @@ class VisualOdometry:
         """
         previous, current = self._reduced(previous), self._reduced(current)
         depth_previous_unscaled = self._reduced_depth(depth_previous_unscaled)
-        flow = self._predicted_flow(previous, current, depth_previous_unscaled)
+        last, flow = self._last, None
+        # by the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames
+        if last is not None and last.ends == (2 * previous.index - current.index, previous.index):
+            flow = PredictedFlow.of(last.relative_pose.T_from_to, depth_previous_unscaled, self._intrinsics)
         tracks = self._tracker.track(previous, current, flow, standing)
         if len(tracks) < MIN_INLIERS:
             measured: Motion | Failed = Failed(f"only {len(tracks)} corners could be tracked")
         else:
             learned = nearest_depth(depth_previous_unscaled, tracks.previous)
             depth = trusted_depth(learned, height_unscaled)
-            ends, votes = (previous.index, current.index), self._votes(tracks)
+            ends, votes = (previous.index, current.index), np.isin(tracks.track_ids, self._fitted)
+            if votes.sum() < MIN_INLIERS:  # few are left that fitted the last motion
+                votes[:] = True
             measured = (
                 self._still(ends, tracks, votes, depth)
                 or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
@@ -173,23 +185,9 @@ class VisualOdometry:
             if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
             sigmas = np.sqrt(np.diag(two_view.covariance)[:3])
-            return RelativeRotation(first.index, last.index, two_view.unit_pose.R_current_previous, sigmas)
+            return RelativeRotation((first.index, last.index), two_view.unit_pose.R_current_previous, sigmas)
 
         return measure
-
-    def _predicted_flow(self, previous: Frame, current: Frame, depth_previous: DepthMap) -> PredictedFlow | None:
-        """By the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames."""
-        last = self._last
-        if last is None or last.ends[1] != previous.index:
-            return None
-        if last.ends[1] - last.ends[0] != current.index - previous.index:
-            return None
-        return PredictedFlow.of(last.relative_pose.T_from_to, depth_previous, self._intrinsics)
-
-    def _votes(self, tracks: Tracks) -> NDArray[np.bool_]:
-        """Which tracks ``(M,)`` have the vote: all, where few are left that fitted the last motion."""
-        fitted = np.isin(tracks.track_ids, self._fitted)
-        return fitted if fitted.sum() >= MIN_INLIERS else np.ones(len(tracks), dtype=bool)
 
     def _matches(
         self,
@@ -323,12 +321,11 @@ class VisualOdometry:
         corrected = self.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
-        start = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
-        count = 0 if start is None else len(start[1])
-        if start is None or count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
+        T_start, inliers = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
+        count = len(inliers)
+        if count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
             return Failed(f"little parallax, and only {known_corners} agree with the learned depth")
-        T_start, inliers = start
         resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
         self._fitted = tracks.track_ids[known][inliers]
         length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))
@@ -350,3 +347,84 @@ class VisualOdometry:
     def _reduced_depth(self, depth: DepthMap) -> DepthMap:
         """The depth map ``(h, w)`` of the reduced image."""
         return depth if depth.shape[::-1] == self._size else resized_depth(depth, *self._size)
+
+
+@dataclass(frozen=True)
+class TriangulatedPoints:
+    """``M`` scene points that a step triangulated, by the identifiers of their tracks ``track_ids`` ``(M,)``.
+
+    z-depths ``(M,)`` in both cameras are in units of the step's length, ``relative_sigma`` ``(M,)`` is that of both.
+    """
+
+    track_ids: NDArray[np.int64]
+    depth_previous: FloatArray
+    depth_current: FloatArray
+    relative_sigma: FloatArray
+
+    def length_ratio(self, earlier: TriangulatedPoints) -> tuple[float, float] | None:
+        """Log of this step's length over that of an earlier one that ends where this begins, with its sigma.
+
+        In the frame between, a point's depth is ``|t| z`` by either step; None with too few common points.
+        """
+        _, first, second = np.intersect1d(earlier.track_ids, self.track_ids, assume_unique=True, return_indices=True)
+        if len(first) < _LEAST_COMMON:
+            return None
+        logarithms = np.log(earlier.depth_current[first] / self.depth_previous[second])
+        weights = 1.0 / (earlier.relative_sigma[first] ** 2 + self.relative_sigma[second] ** 2)
+        middle = weighted_median(logarithms, weights)
+        deviation = mad_sigma(logarithms - middle)
+        return middle, deviation / float(np.sqrt(len(first)))
+
+
+@dataclass(frozen=True)
+class Step:
+    """A ``motion`` whose length learned depth gives, the two-view estimate behind it, and the points triangulated."""
+
+    motion: Motion
+    two_view: TwoViewEstimate
+    points: TriangulatedPoints
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of the corners that fit."""
+        return float(self.two_view.inliers.mean())
+
+    def speed(self, height_unscaled: float | None, seconds: float) -> float:
+        """Camera heights a second, NaN where the height is unknown."""
+        if height_unscaled is None or seconds <= 0:
+            return np.nan
+        return self.motion.length_unscaled / height_unscaled / seconds
+
+
+def most_credible(
+    steps: Sequence[Step | None],
+    matches: Matches,
+    height_unscaled: float | None,
+    seconds: float,
+    history: MotionHistory,
+) -> Step | None:
+    """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
+    estimated = [step for step in steps if step is not None]
+    balance = []
+    for step in estimated:
+        speed = step.speed(height_unscaled, seconds)
+        is_possible = history.is_possible_speed(speed, seconds)
+        votes = [] if is_possible is None else [is_possible]
+        # points of this step and the one before have the ratio of lengths that learned depth has
+        if step.motion.length_ratio is not None and history.speeds and np.isfinite(speed / history.speeds[-1]):
+            ratio, _ = step.motion.length_ratio
+            votes.append(bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT))
+        # the corners on the road are triangulated at the camera's height below it
+        road = matches.on_road & step.two_view.inliers
+        if height_unscaled is not None and road.sum() >= _LEAST_ROAD_CORNERS:
+            rays = matches.rays_previous[road]
+            depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
+            height = float(np.median(depth * rays[:, 1])) * step.motion.length_unscaled
+            votes.append(bool(abs(np.log(max(height, 1e-9) / height_unscaled)) < _AGREEMENT))
+        # the direction is about the median of the last hundred steps, which a few wrong ones do not change
+        prior = history.prior()
+        if np.isfinite(prior.axis_sigma):
+            votes.append(prior.deviation(step.two_view.unit_pose.direction) < 3.0)
+        balance.append(sum(1 if vote else -1 for vote in votes))
+    best = int(np.argmax(balance))
+    return estimated[best] if balance[best] >= 0 else None

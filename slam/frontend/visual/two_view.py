@@ -3,23 +3,34 @@
 Corners alone are ambiguous: where most of them lie on a car that turns with the camera, its corners and distant ones
 lie on the epipolar lines of a motion that neither made (``docs/design/visual-front-end.md``). Two further
 measurements resolve this: the shift of each corner along its epipolar line, which learned depth predicts too; and the
-usual direction of motion.
+usual direction of motion. Residuals of corners are across and along these lines.
+
+A car ahead stays at one place of the image for minutes. Some of its corners fit the camera's motion by chance and bias
+it, but most do not: where many corners were outliers recently, the others are weighted down.
+
+A car that drives along with the camera keeps its corners on their epipolar lines, so geometry alone takes it for a part
+of the scene, farther or nearer than it is; learned depth knows better. But learned depth errs too, over half of the
+image at times, and must not cast out the scene itself. So it is believed only about a region as an object has it:
+connected, of one motion, and without the majority of the road; and about all such regions together only where they do
+not hold the majority of the image's parallax.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any, Self
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frontend.visual.motion import AXIS_SIGMA, MotionHistory, MotionPrior
-from slam.frontend.visual.moving_regions import moving_corners
-from slam.frontend.visual.residuals import Residuals, tangent_of
-from slam.geometry.epipolar import (
+from slam.geometry.multiview import (
     UnitRelativePose,
+    cross,
     triangulated_depth,
     unit_pose_by_essential,
     unit_pose_by_pnp,
@@ -51,6 +62,20 @@ _ALONG_PX = 0.4  # corner noise along the epipolar line, pixels, besides that of
 _EARLY_EXIT_INLIER_RATIO = 0.75  # inlier ratio at which RANSAC stops early
 INLIER_PX = 0.6  # largest epipolar distance of an inlier, pixels
 DEPTH_RELATIVE_SIGMA = 0.2  # least relative sigma of learned depth along an epipolar line
+# hat(w) row by row, by each component of w
+_HATS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+_CELL_PX = 8.0
+_SPREAD_CELLS = 1.5
+_SHARPNESS = 4.0  # power of a cell's inlier ratio over that of the whole image, by which corners weigh
+# decay a step: a half-life of seven steps
+_KEPT = 0.9
+# weight, in corners, of the prior that a cell has the inlier ratio of the whole image
+_PRIOR_CORNERS = 0.5
+# side of the cells that connect corners to a region, pixels: some two spacings of corners
+_REGION_CELL_PX = 24.0
+_LARGEST_SHARE = 0.5
+# largest deviation of the corners of a region from its own motion, over that motion
+_CONSISTENCY = 0.5
 
 
 @dataclass(frozen=True)
@@ -232,10 +257,167 @@ def _with_first_sigma(matches: Matches, motions: Sequence[UnitRelativePose | Non
 
 
 def _support(candidate: TwoViewEstimate, votes: NDArray[np.bool_], prior: MotionPrior) -> float:
-    """Number of votes of inliers that agree with learned depth, less the cost of leaving the usual axis.
-
-    Forwards and backwards are equal.
-    """
-    cosine = abs(float(prior.axis @ candidate.unit_pose.direction))
-    deviation = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
+    """Number of votes of inliers that agree with learned depth, less the cost of leaving the usual axis."""
+    deviation = prior.deviation(candidate.unit_pose.direction)
     return float(candidate.agreeing[votes].sum()) - 0.5 * deviation**2 / _OUTLIER_COST
+
+
+class Residuals:
+    """Residuals of ``M`` corners in two images, in pixels.
+
+    Derivatives ``(5, M)`` are by rotation, in the current camera, and by the direction along both axes of its
+    ``tangent`` ``(3, 2)``; a sixth is by the length. Arrays are coordinate-major, which is several times faster.
+    """
+
+    def __init__(
+        self, rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, focal_px: float
+    ) -> None:
+        """From rays ``(M, 3)`` with z = 1, and learned depths ``(M,)`` in the earlier camera or NaN."""
+        self._previous = np.ascontiguousarray(rays_previous.T)
+        self._current = np.ascontiguousarray(rays_current.T)
+        # every bilinear form of the rays is a matrix times one of these
+        self._both = _products(self._current, self._previous)
+        self._previous_twice = _products(self._previous, self._previous)
+        self._current_twice = _products(self._current, self._current)
+        self._inverse_depth = np.where(np.isfinite(depth_previous), 1.0 / depth_previous, 0.0)
+        self._focal_px = focal_px
+
+    def across(self, unit_pose: UnitRelativePose, tangent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sampson distances ``(M,)`` and their derivatives ``(5, M)`` (Hartley and Zisserman 2004, Eq. 11.9).
+
+        The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the
+        motion by the square of the corners' noise.
+        """
+        # E = hat(t) R and its five derivatives
+        essential = np.empty((6, 3, 3))
+        essential[0] = hat = (unit_pose.direction @ _HATS).reshape(3, 3)
+        essential[1:4] = hat @ _HATS.reshape(3, 3, 3)
+        essential[4:] = (tangent.T @ _HATS).reshape(2, 3, 3)
+        essential = essential @ unit_pose.R_current_previous
+        algebraic = essential.reshape(6, 9) @ self._both
+        # squared lengths of E x and E^T x' without their last coefficients, and half their derivatives
+        lines_current = essential[:, :2].swapaxes(1, 2) @ essential[0, :2]
+        lines_previous = essential[:, :, :2] @ essential[0, :, :2].T
+        squares = lines_current.reshape(6, 9) @ self._previous_twice
+        squares += lines_previous.reshape(6, 9) @ self._current_twice
+        gradient = np.sqrt(np.maximum(squares[0], 1e-18))
+        distance = algebraic[0] / gradient
+        slopes = (algebraic[1:] - distance / gradient * squares[1:]) / gradient
+        return distance * self._focal_px, slopes * self._focal_px
+
+    def along(
+        self, unit_pose: UnitRelativePose, length: float, tangent: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Distances ``(M,)`` along the epipolar lines from the points predicted by learned depth.
+
+        Also their derivatives ``(6, M)``, and the shift along the line predicted by learned depth ``(M,)``.
+        """
+        rotated = unit_pose.R_current_previous @ self._previous
+        points = rotated + (length * unit_pose.direction)[:, None] * self._inverse_depth  # over depth
+        ahead = np.maximum(points[2], 1e-6)
+        expected = points[:2] / ahead
+        line = expected - rotated[:2] / np.maximum(rotated[2], 1e-6)
+        shift = np.sqrt((line**2).sum(axis=0))
+        line /= np.maximum(shift, 1e-9)
+        distance = ((expected - self._current[:2]) * line).sum(axis=0)
+        by_point = np.concatenate([line, -(line * expected).sum(axis=0)[None]]) / ahead
+        slopes = np.empty((6, len(distance)))
+        slopes[:3] = cross(rotated, by_point)
+        slopes[3:5] = tangent.T @ by_point * (length * self._inverse_depth)
+        slopes[5] = unit_pose.direction @ by_point * self._inverse_depth
+        return distance * self._focal_px, slopes * self._focal_px, shift * self._focal_px
+
+
+def _products(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Outer products ``(9, M)`` of vectors ``(3, M)``."""
+    return (a[:, None] * b).reshape(9, -1)
+
+
+def tangent_of(direction: FloatArray) -> FloatArray:
+    """Two unit axes ``(3, 2)`` orthogonal to a ``direction`` ``(3,)`` and each other (Duff et al. 2017)."""
+    x, y, z = direction.tolist()
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
+
+
+@dataclass(frozen=True)
+class DynamicMask:
+    """Inliers and all corners of the last steps by cell of the image ``(h, w)``, decayed exponentially."""
+
+    inliers: FloatArray
+    corners: FloatArray
+
+    @classmethod
+    def empty(cls, width: int, height: int) -> Self:
+        """A mask without observations for images of ``width`` x ``height`` pixels."""
+        shape = int(np.ceil(height / _CELL_PX)), int(np.ceil(width / _CELL_PX))
+        return cls(np.zeros(shape), np.zeros(shape))
+
+    def weights(self, pixels: FloatArray) -> FloatArray:
+        """Weights in (0, 1] ``(M,)`` of corners at ``pixels`` ``(M, 2)``."""
+        if self.corners.sum() < 1.0:
+            return np.ones(len(pixels))
+        usual = self.inliers.sum() / self.corners.sum()
+        inliers, corners = (cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self.inliers, self.corners))
+        ratio = (inliers + _PRIOR_CORNERS * usual) / (corners + _PRIOR_CORNERS)
+        return np.asarray(np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS)
+
+    def updated(self, pixels: FloatArray, is_inlier: NDArray[np.bool_]) -> Self:
+        """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""
+        inliers, corners = _KEPT * self.inliers, _KEPT * self.corners
+        cells = self._cells(pixels)
+        np.add.at(corners, cells, 1.0)
+        np.add.at(inliers, cells, is_inlier.astype(float))
+        return type(self)(inliers, corners)
+
+    def _cells(self, pixels: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        column, row = (np.floor(pixels.T / _CELL_PX)).astype(np.int64)
+        height, width = self.corners.shape
+        return np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+
+
+def moving_corners(
+    pixels: FloatArray,
+    on_road: NDArray[np.bool_],
+    agreeing: NDArray[np.bool_],
+    contradicting: NDArray[np.bool_],
+    expected_px: FloatArray,
+    seen_px: FloatArray,
+) -> NDArray[np.bool_]:
+    """Which of the contradicting corners ``(M,)`` lie in a region that moves.
+
+    Args:
+        pixels: ``(M, 2)``, of any origin.
+        on_road: corners that learned depth puts on the road ``(M,)``.
+        agreeing: corners on their epipolar lines whose shift along them is as learned depth has it ``(M,)``.
+        contradicting: those on their lines whose shift is another ``(M,)``.
+        expected_px: the shift by learned depth ``(M,)``.
+        seen_px: the shift along the line ``(M,)``, negative away from it.
+    """
+    moving = np.zeros(len(pixels), dtype=bool)
+    if not contradicting.any():
+        return moving
+    cells = np.floor((pixels[contradicting] - pixels[contradicting].min(axis=0)) / _REGION_CELL_PX).astype(np.int64)
+    occupied = np.zeros(tuple(cells.max(axis=0) + 1), np.uint8)
+    occupied[tuple(cells.T)] = 1
+    count, labels = cv2.connectedComponents(occupied, connectivity=8)
+    region = labels[tuple(cells.T)]
+    motion = 1.0 - seen_px[contradicting] / np.maximum(expected_px[contradicting], 1e-3)
+    parallax = np.where(agreeing | contradicting, np.abs(seen_px), 0.0)
+    on_road_px = np.bincount(region, (parallax * on_road)[contradicting], count)
+    is_most_of_road = on_road_px > _LARGEST_SHARE * parallax[on_road].sum()
+    middle = _medians(motion, region, count)
+    scatter = _medians(np.abs(motion - middle[region]), region, count)
+    moving[contradicting] = (~is_most_of_road & (scatter < _CONSISTENCY * np.abs(middle)))[region]
+    is_most = parallax[moving].sum() > _LARGEST_SHARE * parallax.sum()
+    return np.zeros_like(moving) if is_most else moving
+
+
+def _medians(values: FloatArray, groups: NDArray[np.integer[Any]], count: int) -> FloatArray:
+    """The median of the values ``(K,)`` of each group, ``(count,)``; 0 of an empty one."""
+    order, sizes = np.lexsort((values, groups)), np.bincount(groups, minlength=count)
+    first, last = np.cumsum(sizes) - sizes, len(values) - 1
+    below, above = (np.minimum(first + np.maximum(half, 0), last) for half in ((sizes - 1) // 2, sizes // 2))
+    return np.where(sizes > 0, 0.5 * (values[order[below]] + values[order[above]]), 0.0)

@@ -100,7 +100,7 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
 def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("slam.frontend.scale.road_plane._ROAD_ROWS", (0.0, 0.001))  # at the horizon
+    monkeypatch.setattr("slam.frontend.road._ROAD_ROWS", (0.0, 0.001))  # at the horizon
     target, messages = filled(street, tmp_path)
     settings = (*SETTINGS, "road.enabled=false", f"scale.mode={mode}")
     request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=600)

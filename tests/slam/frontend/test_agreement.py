@@ -15,9 +15,8 @@ from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
 from slam.frontend.drive import Drive, Segment, frame_support
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
-from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.focal_length import FocalLength
 from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry import se3
 from slam.runtime.errors import Failed
 

@@ -1,4 +1,7 @@
-"""The scale by GPS fixes whose errors are large beside short tracks."""
+"""The scale by GPS fixes whose errors are large beside short tracks.
+
+The local frame against distances on the ellipsoid that are known in closed form.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,9 @@ import numpy as np
 import pytest
 
 from slam.config.sections import GpsConfig
-from slam.frontend.gps import GpsFixes
-from slam.frontend.scale.metric_scale import ScaleEstimate
-from slam.geometry.geodesy import GpsTrack, LocalFrame
+from slam.frames import GpsTrack
+from slam.frontend.gps import GpsFixes, LocalFrame
+from slam.frontend.scale import ScaleEstimate
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
 
@@ -57,3 +60,20 @@ def test_errors_of_fixes_do_not_lengthen_the_scale(walk: FloatArray) -> None:
 def test_a_track_under_the_documented_length_gives_no_scale() -> None:
     found = [scale(straight(112.0), seed) for seed in range(12)]
     assert all(isinstance(each, Failed) and "moves too little" in each.reason for each in found)
+
+
+@pytest.mark.parametrize("latitude", [-72.0, 0.0, 49.0, 89.9])
+def test_there_and_back(latitude: float) -> None:
+    frame = LocalFrame(np.array([latitude, 8.4, 115.0]))
+    points = np.random.default_rng(0).normal(scale=[3e3, 3e3, 50.0], size=(50, 3))
+    np.testing.assert_allclose(frame.points(frame.places(points)), points, atol=1e-6)
+    np.testing.assert_allclose(frame.points(np.array([[latitude, 8.4, 115.0]])), 0.0, atol=1e-8)
+
+
+def test_a_minute_of_arc_has_its_length() -> None:
+    """At the equator a minute of longitude is a/3437.7 long; at the pole a minute of latitude a^2/b/3437.7."""
+    minute = np.deg2rad(1 / 60)
+    east = LocalFrame(np.array([0.0, 0.0, 0.0])).points(np.array([[0.0, 1 / 60, 0.0]]))[0]
+    assert east[0] == pytest.approx(6378137.0 * minute, abs=1e-3) and east[1] == pytest.approx(0.0, abs=1e-9)
+    north = LocalFrame(np.array([90.0, 0.0, 0.0])).points(np.array([[90.0 - 1 / 60, 180.0, 0.0]]))[0]
+    assert np.hypot(north[0], north[1]) == pytest.approx(6378137.0**2 / 6356752.314245179 * minute, abs=1e-2)

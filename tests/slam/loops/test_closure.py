@@ -12,11 +12,10 @@ from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import LoopsConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
-from slam.frames import Frame, Intrinsics, View
-from slam.geometry.se3 import FloatArray, invert, rotation_angle
-from slam.loops.closure import MOST_REJECTED, close_loops
-from slam.loops.descriptors import FeatureExtractor
-from slam.loops.verification import Loop
+from slam.frames import LOOP_SOURCE, Frame, Intrinsics, RelativePose, View
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, rotation_angle
+from slam.loops.closure import MOST_REJECTED, Track, agreeing, close_loops
+from slam.loops.recognition import OF_FRAMES, FeatureExtractor, Loop
 from slam.pipeline import observer
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline
@@ -28,6 +27,7 @@ from slam.simulation.street import SimulatedStreet
 SIZE = (312, 96)
 FACTOR = 0.2
 NOISE = OracleNoise(np.deg2rad(0.3), 0.05, 0.005, 0.15, seed=3)
+SIGMAS = np.repeat([np.deg2rad(0.3), 0.2], 3)
 
 
 class Drive(RecordedSequence):
@@ -150,3 +150,52 @@ def test_features_are_spread_and_bounded() -> None:
     assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
     blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
     assert len(blank) == 0
+
+
+def ring(yaw_error: float = 0.0) -> FloatArray:
+    """Once and a quarter round a circle of 200 frames, one metre a frame."""
+    vector = np.tile([0.0, 2 * np.pi / 200 + yaw_error, 0.0], (249, 1))
+    return chain(from_rotation_vector(vector, np.tile([0.0, 0.0, 1.0], (249, 1))))
+
+
+def loop(earlier: int, later: int, T: FloatArray, shift: float = 0.0, inliers: int = 40) -> Loop:
+    T_from_to = invert(T[earlier]) @ T[later] @ from_rotation_vector(np.zeros(3), np.array([shift, 0.0, 0.0]))
+    return Loop(RelativePose(earlier, later, T_from_to, SIGMAS, LOOP_SOURCE), inliers, 0.5)
+
+
+def test_loops_of_one_stretch_support_each_other_despite_drift() -> None:
+    true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
+    kept, refused = agreeing(true, Track.of_drive(ring(yaw_error=0.0005)), OF_FRAMES)
+    assert len(kept) == 10 and refused == []
+
+
+def test_a_contradicted_loop_is_refused() -> None:
+    true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
+    kept, refused = agreeing([*true, loop(6, 206, ring(), shift=8.0)], Track.of_drive(ring()), OF_FRAMES)
+    assert [k.ends for k in kept] == [k.ends for k in true]
+    assert [r.from_index for r in refused] == [6] and "contradicted by 7 of 7" in refused[0].reason
+
+
+def test_a_loop_without_support_needs_many_inliers() -> None:
+    for inliers, expected in ((40, 0), (300, 1)):
+        kept, refused = agreeing([loop(5, 205, ring(), inliers=inliers)], Track.of_drive(ring()), OF_FRAMES)
+        assert len(kept) == expected and len(kept) + len(refused) == 1
+    assert "lacks support" in agreeing([loop(5, 205, ring())], Track.of_drive(ring()), OF_FRAMES)[1][0].reason
+
+
+def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:
+    far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
+    kept, refused = agreeing(far, Track.of_drive(ring()), OF_FRAMES)
+    assert kept == [] and all("corrects the odometry by more than 30% of" in r.reason for r in refused)
+
+
+def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> None:
+    """Two maps of one drive: where odometry relates them, a loop is bound by it, else by other loops alone."""
+    track = Track.of_drive(ring())
+    maps = (track.frames >= 150).astype(np.intp)
+    far = [loop(5, 205, ring(), shift=-90.0, inliers=300)]
+    kept, (refused,) = agreeing(far, replace(track, maps=maps), OF_FRAMES)
+    assert kept == [] and "corrects the odometry" in refused.reason
+    unsure = track.path + 300.0 * maps
+    assert len(agreeing(far, replace(track, maps=maps, path=unsure), OF_FRAMES)[0]) == 1
+    assert len(agreeing(far, replace(track, maps=maps, worlds=maps), OF_FRAMES)[0]) == 1

@@ -13,7 +13,7 @@ import room
 from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
-from slam.loops.descriptors import FeatureExtractor
+from slam.loops.recognition import FeatureExtractor
 from slam.mapping.depth import DepthRefiner
 from slam.mapping.submap import Fusion
 from slam.pipeline.run import SlamPipeline
@@ -69,5 +69,5 @@ def test_calls_a_frame_of_a_hand_held_camera(monkeypatch: pytest.MonkeyPatch):
     """Two searches of corners for the frame; for a keyframe, two in each keyframe that still finds some of them."""
     truth, calls = room.walk(40), Counter[str]()
     monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", counted(calls, "flow", cv2.calcOpticalFlowPyrLK))
-    keyframes = room.tracked(truth).segments[-1].map.keyframes
+    keyframes = room.tracked(truth).segments[-1].keyframes
     assert 0 < calls["flow"] <= 2 * len(truth) + 16 * len(keyframes)

@@ -15,16 +15,14 @@ from erfsfm.common.processes import opencv_threads
 from slam import Slam
 from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import LOOP_SOURCE, DepthMap, Frame, RelativePose, View
+from slam.frontend.completion import complete_drive
 from slam.frontend.drive import Drive
-from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
-from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, rotation_angle, umeyama
-from slam.loops.closure import LoopClosures, find_loops
-from slam.loops.consistency import Track
-from slam.loops.verification import Loop
+from slam.loops.closure import LoopClosures, Track, find_loops
+from slam.loops.recognition import Loop
 from slam.pipeline import keyframe_maps
 from slam.pipeline.keyframe_maps import FrontEnd, KeyframeTracking, MapClosure, choose, close_maps
 from slam.pipeline.observer import Observer
@@ -41,7 +39,7 @@ def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
         T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
         pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
         motions.append(Motion(pose, np.eye(6), seconds=seconds))
-    return Drive(motions=motions, roads=[GroundPlane(1.0, np.array([0.0, 1.0, 0.0]), 1.0)] * count)
+    return Drive(motions=motions, roads=[1.0] * count)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +114,7 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
             if k in interrupted:
                 observer.measured()
         drive = completed(observer)
-    keyframes = drive.maps[-1].map.keyframes
+    keyframes = drive.maps[-1].keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
     assert [k for k in predicted if k >= 20] == [keyframe.index for keyframe in keyframes if keyframe.index >= 20]
     assert [snippet.target for snippet in drive.trusted if snippet.target > 18] == [22, 26, 30, 34]

@@ -7,10 +7,9 @@ import pytest
 from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
-from slam.frames import Image, Intrinsics
-from slam.frontend.gps import Location
+from slam.frames import GpsTrack, Image, Intrinsics
+from slam.frontend.gps import LocalFrame, Location
 from slam.geometry import se3
-from slam.geometry.geodesy import GpsTrack, LocalFrame
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline

@@ -20,7 +20,7 @@ from erfsfm.common.readers.images import read_depth_map
 from slam import run_slam
 from slam.config.sections import ScaleMode
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, Sequence
-from slam.frontend.scale.metric_scale import LengthUnit, Scale, ScaleEstimate
+from slam.frontend.scale import LengthUnit, Scale, ScaleEstimate
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray, apply
 from slam.mapping.depth import KeyframeDepth

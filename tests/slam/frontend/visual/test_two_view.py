@@ -1,4 +1,8 @@
-"""The motion between two views from corners, learned depth and the motion prior."""
+"""The motion between two views from corners, learned depth and the motion prior.
+
+Residuals across and along epipolar lines, and their derivatives by finite differences. Which corners learned depth may
+cast out as moving, and which weigh less because many were outliers recently.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +15,33 @@ import pytest
 from slam.frames import Frame, Intrinsics
 from slam.frontend.visual.motion import Motion, MotionHistory
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, estimate, refined
+from slam.frontend.visual.two_view import (
+    DEPTH_RELATIVE_SIGMA,
+    INLIER_PX,
+    DynamicMask,
+    Matches,
+    Residuals,
+    TwoViewEstimate,
+    estimate,
+    moving_corners,
+    refined,
+    tangent_of,
+)
 from slam.geometry import se3
-from slam.geometry.epipolar import UnitRelativePose, unit_pose_by_essential
+from slam.geometry.multiview import UnitRelativePose, unit_pose_by_essential
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 FOCAL_PX = 240.0
 CAR = 40
 NO_HISTORY = MotionHistory()
+LENGTH = 0.9
+RNG = np.random.default_rng(0)
+SCENE = RNG.uniform([0, 0], [1200, 370], (300, 2))
+MOVING_CAR = RNG.uniform([600, 180], [700, 250], (20, 2))
+PIXELS = np.concatenate([SCENE, MOVING_CAR])
+OF_CAR = np.arange(len(PIXELS)) >= len(SCENE)
+EXPECTED = np.concatenate([RNG.uniform(1, 15, len(SCENE)), np.full(len(MOVING_CAR), 8.0)])
 
 
 def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int = 0) -> TwoViewEstimate:
@@ -175,3 +197,152 @@ def test_learned_depth_that_sees_far_things_too_near_casts_out_no_near_corner():
         kept.append(found.inliers[near].mean())
     assert max(errors_deg) < 0.1
     assert min(kept) > 0.95  # as many as have less than four sigmas of noise across their epipolar lines
+
+
+@pytest.fixture
+def unit_pose() -> UnitRelativePose:
+    R = se3.from_rotation_vector(np.array([0.01, 0.06, 0.02]), np.zeros(3))[:3, :3]
+    return UnitRelativePose(R, np.array([0.1, -0.05, -1.0]) / np.linalg.norm([0.1, -0.05, -1.0]))
+
+
+def rays(seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matched rays ``(20, 3)``, far off their lines, and learned depths ``(20,)`` of which one is unknown."""
+    rng = np.random.default_rng(seed)
+    previous = np.column_stack([rng.uniform(-1.0, 1.0, (20, 2)), np.ones(20)])
+    current = previous + np.column_stack([rng.normal(0.0, 0.2, (20, 2)), np.zeros(20)])
+    return previous, current, np.concatenate([[np.nan], rng.uniform(4.0, 30.0, 19)])
+
+
+def moved(unit_pose: UnitRelativePose, step: np.ndarray, tangent: np.ndarray) -> UnitRelativePose:
+    slid = unit_pose.direction + tangent @ step[3:5]
+    turned = se3.from_rotation_vector(step[:3], np.zeros(3))[:3, :3]
+    return UnitRelativePose(turned @ unit_pose.R_current_previous, slid / np.linalg.norm(slid))
+
+
+def test_across_is_the_sampson_distance_of_the_essential_matrix(unit_pose: UnitRelativePose):
+    previous, current, depth = rays()
+    E = np.cross(np.eye(3), unit_pose.direction).T @ unit_pose.R_current_previous
+    expected = []
+    for x, y in zip(previous, current, strict=True):
+        gradient = np.concatenate([(E @ x)[:2], (E.T @ y)[:2]])
+        expected.append(FOCAL_PX * (y @ E @ x) / np.linalg.norm(gradient))
+    across, _ = Residuals(previous, current, depth, FOCAL_PX).across(unit_pose, tangent_of(unit_pose.direction))
+    np.testing.assert_allclose(np.abs(across), np.abs(expected), rtol=1e-9)
+    assert len(set(np.sign(across) * np.sign(expected))) == 1
+
+
+def test_along_is_the_distance_to_the_point_predicted_by_depth(unit_pose: UnitRelativePose):
+    """Corners moved along their lines by what is then found; across them nothing counts."""
+    previous, _, depth = rays()
+    points = se3.apply(se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction), previous * depth[:, None])
+    seen = points / points[:, 2:]
+    turned = previous @ unit_pose.R_current_previous.T
+    line = (seen - turned / turned[:, 2:])[:, :2]
+    line /= np.linalg.norm(line, axis=1)[:, None]
+    aside = np.linspace(-0.02, 0.02, 20)
+    current = seen.copy()
+    current[:, :2] += aside[:, None] * line + 0.01 * line[:, ::-1] * [1.0, -1.0]
+    tangent = tangent_of(unit_pose.direction)
+    along, _, shift_px = Residuals(previous, current, depth, FOCAL_PX).along(unit_pose, LENGTH, tangent)
+    np.testing.assert_allclose(along[1:], -FOCAL_PX * aside[1:], atol=1e-9)
+    expected = FOCAL_PX * np.linalg.norm((seen - turned / turned[:, 2:])[:, :2], axis=1)
+    np.testing.assert_allclose(shift_px[1:], expected[1:], rtol=1e-9)
+
+
+def test_derivatives_across_are_those_of_finite_differences(unit_pose: UnitRelativePose):
+    """With corners far off their lines, where the change of the gradient's norm counts."""
+    residuals, tangent = Residuals(*rays(), FOCAL_PX), tangent_of(unit_pose.direction)
+    _, slopes = residuals.across(unit_pose, tangent)
+    for k in range(5):
+        step = 1e-6 * np.eye(5)[k]
+        ahead, behind = (residuals.across(moved(unit_pose, sign * step, tangent), tangent)[0] for sign in (1, -1))
+        np.testing.assert_allclose((ahead - behind) / 2e-6, slopes[k], atol=1e-8 * FOCAL_PX)
+
+
+def test_derivatives_along_are_those_of_finite_differences(unit_pose: UnitRelativePose):
+    """Corners on their lines, where the rotation of the line has no effect; a corner of unknown depth is left out."""
+    previous, _, depth = rays()
+    points = se3.apply(se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction), previous * depth[:, None])
+    residuals, tangent = Residuals(previous, points / points[:, 2:], depth, FOCAL_PX), tangent_of(unit_pose.direction)
+    _, slopes, _ = residuals.along(unit_pose, LENGTH, tangent)
+    for k in range(6):
+        step = 1e-6 * np.eye(6)[k]
+        ahead, behind = (
+            residuals.along(moved(unit_pose, sign * step, tangent), LENGTH + sign * step[5], tangent)[0]
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(((ahead - behind) / 2e-6)[1:], slopes[k][1:], atol=1e-7 * FOCAL_PX)
+
+
+@pytest.mark.parametrize(
+    "direction", [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0, -0.8], [0.6, -0.8, 0]]
+)
+def test_a_tangent_and_its_direction_are_orthonormal(direction: list[float]):
+    axes = np.column_stack([tangent_of(np.array(direction)), direction])
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+
+
+def test_a_connected_region_of_one_motion_moves() -> None:
+    seen = np.where(OF_CAR, 0.3 * EXPECTED, EXPECTED)
+    moving = moving_corners(PIXELS, PIXELS[:, 1] > 300, ~OF_CAR, OF_CAR, EXPECTED, seen)
+    np.testing.assert_array_equal(moving, OF_CAR)
+
+
+def test_the_majority_of_the_parallax_does_not_move() -> None:
+    """Learned depth agrees with the far corners, which are many: the near ones are the scene all the same."""
+    near = PIXELS[:, 1] > 240
+    expected = np.where(near, 8.0, 1.0)
+    seen = np.where(near, 20.0, 1.0)
+    moving = moving_corners(PIXELS, np.zeros(len(PIXELS), bool), ~near, near, expected, seen)
+    assert not moving.any()
+
+
+def test_the_majority_of_the_road_does_not_move() -> None:
+    on_road = OF_CAR | (np.arange(len(PIXELS)) < 10)
+    seen = np.where(OF_CAR, 0.3 * EXPECTED, EXPECTED)
+    moving = moving_corners(PIXELS, on_road & OF_CAR, ~OF_CAR, OF_CAR, EXPECTED, seen)
+    assert not moving.any()
+
+
+def test_corners_that_contradict_each_other_do_not_move() -> None:
+    seen = EXPECTED.copy()
+    seen[OF_CAR] = EXPECTED[OF_CAR] * np.resize([0.3, 1.7], len(MOVING_CAR))
+    moving = moving_corners(PIXELS, np.zeros(len(PIXELS), bool), ~OF_CAR, OF_CAR, EXPECTED, seen)
+    assert not moving.any()
+
+
+PLACE = np.array([300.0, 70.0])  # of a car
+
+
+def mask_with_car(steps: int) -> tuple[DynamicMask, np.ndarray]:
+    """One in five corners near ``PLACE`` are inliers, nine in ten of the static scene (their pixels are returned)."""
+    dynamic_mask = DynamicMask.empty(416, 128)
+    static = RNG.uniform([0.0, 0.0], [240.0, 127.0], (150, 2))
+    for _ in range(steps):
+        car = PLACE + RNG.uniform(-12.0, 12.0, (15, 2))
+        is_inlier = np.concatenate([RNG.random(150) < 0.9, RNG.random(15) < 0.2])
+        dynamic_mask = dynamic_mask.updated(np.concatenate([static, car]), is_inlier)
+    return dynamic_mask, static
+
+
+def test_corners_on_a_moving_car_are_weighted_down() -> None:
+    dynamic_mask, static = mask_with_car(8)
+    assert dynamic_mask.weights(PLACE[None]) < 0.05
+    assert np.median(dynamic_mask.weights(static)) > 0.8
+    assert dynamic_mask.weights(np.array([[400.0, 10.0]])) > 0.8  # no corner was there
+
+
+def test_outliers_decay_after_the_car_has_left() -> None:
+    dynamic_mask, static = mask_with_car(8)
+    for _ in range(40):
+        pixels = np.concatenate([static, np.tile(PLACE, (3, 1))])
+        dynamic_mask = dynamic_mask.updated(pixels, np.ones(153, dtype=bool))
+    assert dynamic_mask.weights(PLACE[None]) > 0.8
+
+
+def test_corners_beyond_the_edge_belong_to_the_nearest_cell() -> None:
+    empty = DynamicMask.empty(416, 128)
+    dynamic_mask = empty.updated(np.array([[416.0, 128.0], [-0.4, -0.4]]), np.array([True, False]))
+    assert np.isfinite(dynamic_mask.weights(np.array([[416.0, 128.0], [-0.4, 0.0]]))).all()
+    assert dynamic_mask.corners[-1, -1] == dynamic_mask.inliers[-1, -1] == dynamic_mask.corners[0, 0] == 1.0
+    assert dynamic_mask.inliers[0, 0] == 0.0

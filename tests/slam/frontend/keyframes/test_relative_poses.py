@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.unit import units_by_floor
+from slam.frontend.keyframes.relative_poses import units_by_floor
 from slam.geometry.se3 import from_rotation_vector, invert
 
 HEIGHT_M = 1.5

@@ -1,22 +1,30 @@
-"""Gap interpolation: frames without a measurement follow the constant-velocity model, with wide sigmas."""
+"""A drive completed after its last frame: gaps interpolated, rotations smoothed, segments found.
+
+Frames without a measurement follow the constant-velocity model, with wide sigmas.
+
+Rotations of single steps are corrected by relative rotations across several steps, and directions with them. The
+tracking error of a corner is the same over two steps as over one, and a drift of its window is a bias of every step.
+Measured between frames two steps apart, the same error enters half as often. Corners that turn the camera too far move
+it to the other side: the direction of a step is corrected by as much as its covariance with the rotation says
+(``docs/design/visual-front-end.md``).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
-from itertools import pairwise
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, runs
 from slam.frontend.drive import Drive, Segment
-from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
-from slam.frontend.network_factors import calibrate_network, network_steps
-from slam.frontend.rotation_smoothing import smooth_rotations
-from slam.frontend.scale.road_homography import with_slope
-from slam.frontend.visual.motion import Motion, Steps
+from slam.frontend.factors import calibrate_network, equal_step, network_steps
+from slam.frontend.keyframes.relative_poses import KeyframePoses
+from slam.frontend.road import with_slope
+from slam.frontend.visual.motion import Motion, RelativeRotation, Steps, path_between, shortest_by_start, triangulated
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError
 
@@ -31,6 +39,11 @@ _SIGMA_FLOOR = 1e-6
 _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
 _TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
 _NO_MAPS = KeyframePoses()
+# sigmas of single steps are widened by this: the errors of neighbouring steps are correlated
+_STEP_WIDENING = 3.0
+_ITERATIONS = 4
+_OUTLIER_SIGMAS = 3.0
+_BLOCK = np.arange(9)
 
 
 def complete_drive(
@@ -208,49 +221,6 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
     return {**known, **dict(zip(unknown, T, strict=True))}
 
 
-def equal_step(T_a_b: FloatArray, n: int) -> FloatArray:
-    """One of n equal steps from a to b: the transform ``(4, 4)`` whose n-th power is ``T_a_b``."""
-    rotation_vector = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
-    powers = Rotation.from_rotvec(np.arange(n)[:, None] * rotation_vector).as_matrix()
-    return from_rotation_vector(rotation_vector, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))
-
-
-def join_gap_ends(
-    interpolated: Sequence[RelativePose],
-    measured: Sequence[RelativePose],
-    by_map: Sequence[RelativePose],
-    maps: Mapping[int, int],
-) -> list[RelativePose]:
-    """The interpolated steps. Equal steps across a gap replace the steps in the gap if one map has both sides.
-
-    Constant velocity is a poor guess over a long gap, and many such steps would outvote the one pose by the map.
-
-    Args:
-        interpolated: steps without a measurement, in one unit with all others.
-        measured: steps between other frames.
-        by_map: relative poses within maps.
-        maps: the map of each frame that has a pose in one.
-    """
-    T_map_camera = chained(by_map)
-    loose = {pose.from_index: pose for pose in interpolated}
-    T_step = {pose.from_index: pose.T_from_to for pose in measured if pose.to_index == pose.from_index + 1}
-    T_step |= {first: pose.T_from_to for first, pose in loose.items()}
-    for first, last in pairwise(sorted(maps)):
-        steps = range(first, last)
-        if maps[first] != maps[last] or loose.keys().isdisjoint(steps) or not T_step.keys() >= set(steps):
-            continue
-        begin, end = max(runs(loose.keys() & set(steps)), key=lambda run: run[1] - run[0])
-        T_first_begin = reduce(np.matmul, (T_step[k] for k in range(first, begin)), np.eye(4))
-        T_end_last = reduce(np.matmul, (T_step[k] for k in range(end + 1, last)), np.eye(4))
-        T_first_last = invert(T_map_camera[first]) @ T_map_camera[last]
-        T = equal_step(invert(T_first_begin) @ T_first_last @ invert(T_end_last), end + 1 - begin)
-        length = float(np.linalg.norm(T[:3, 3]))
-        for k in range(begin, end + 1):
-            sigmas = np.maximum(loose[k].sigmas, [0.0, 0.0, 0.0, length, length, length])
-            loose[k] = replace(loose[k], T_from_to=T, sigmas=sigmas)
-    return list(loose.values())
-
-
 def _filled(
     snippets: Sequence[SnippetPoses], steps: Mapping[int, FloatArray], count: int, sources: int
 ) -> list[SnippetPoses]:
@@ -266,3 +236,66 @@ def _filled(
             snippet = SnippetPoses(target, tuple(around), T_source_target)
         filled.append(snippet)
     return filled
+
+
+def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation]) -> Steps:
+    """The steps with rotations fitted robustly to single steps and relative rotations, directions corrected alike.
+
+    Least squares over one small rotation for each triangulated step, in its current camera. The residual of a
+    relative rotation is the sum of the corrections of its steps, each in its last camera. Rotations over a step that is
+    not triangulated are not used.
+    """
+    motions = triangulated(steps)
+    by_start = shortest_by_start(motions)
+    paths = [(rotation, path_between(by_start, *rotation.ends)) for rotation in relative_rotations]
+    usable = [(rotation, path) for rotation, path in paths if path]
+    if not usable:
+        return steps
+    T_current_previous = invert(np.array([motion.relative_pose.T_from_to for motion in motions.values()]))
+    R_current_previous = dict(zip(motions, T_current_previous[:, :3, :3], strict=True))
+    A, target = _equations(R_current_previous, usable)
+    # relative rotations that overlap share their images: overlapping ones count as one
+    overlapping = max(len(path) for _, path in usable)
+    sigmas = np.concatenate([motion.relative_pose.sigmas[:3] for motion in motions.values()])
+    own = 1.0 / (_STEP_WIDENING * sigmas) ** 2
+    prior = coo_array((own, (np.arange(len(own)),) * 2)).tocsr()
+    correction = np.zeros(len(own))
+    for _ in range(_ITERATIONS):
+        residual = np.linalg.norm((A @ correction - target).reshape(-1, 3), axis=1)
+        weights = np.repeat(1.0 / (1.0 + (residual / _OUTLIER_SIGMAS) ** 2), 3) / overlapping
+        weighted = A.multiply(weights[:, None]).T.tocsr()
+        correction = np.atleast_1d(spsolve((weighted @ A + prior).tocsc(), weighted @ target))
+    turns = correction.reshape(-1, 3)
+    T_current_previous[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ T_current_previous[:, :3, :3]
+    covariances = np.array([motion.covariance for motion in motions.values()])
+    moves = covariances[:, 3:, :3] @ np.linalg.solve(covariances[:, :3, :3], turns[:, :, None])
+    directions = T_current_previous[:, :3, 3]
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = directions + lengths * moves[:, :, 0]
+    T_current_previous[:, :3, 3] = turned * lengths / np.linalg.norm(turned, axis=1, keepdims=True)
+    smoothed = {
+        ends: replace(motion, relative_pose=replace(motion.relative_pose, T_from_to=T))
+        for (ends, motion), T in zip(motions.items(), invert(T_current_previous), strict=True)
+    }
+    return {**steps, **smoothed}
+
+
+def _equations(
+    R_current_previous: Mapping[Ends, FloatArray], usable: Sequence[tuple[RelativeRotation, list[Ends]]]
+) -> tuple[csr_array, FloatArray]:
+    """Whitened equations of all relative rotations in the corrections of steps: matrix and right side."""
+    place = {ends: 3 * n for n, ends in enumerate(R_current_previous)}
+    rows, columns, entries, R_residual = [], [], [], []
+    for n, (rotation, path) in enumerate(usable):
+        R_last_step = np.eye(3)
+        for ends in reversed(path):
+            rows.append(3 * n + _BLOCK // 3)
+            columns.append(place[ends] + _BLOCK % 3)
+            entries.append((R_last_step / rotation.sigmas[:, None]).ravel())
+            R_last_step = R_last_step @ R_current_previous[ends]
+        R_residual.append(rotation.R_to_from @ R_last_step.T)
+    sigmas = np.array([rotation.sigmas for rotation, _ in usable])
+    target = Rotation.from_matrix(np.array(R_residual)).as_rotvec() / sigmas
+    shape = 3 * len(usable), 3 * len(place)
+    A = coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+    return A.tocsr(), target.ravel()

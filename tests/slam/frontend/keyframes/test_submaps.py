@@ -1,13 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.local_map import LocalMap, MapSegment, TrackedKeyframe
-from slam.frontend.keyframes.parts import parts_of
-from slam.frontend.keyframes.relative_poses import keyframe_poses
-from slam.frontend.keyframes.unit import learned_unit
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.relative_poses import keyframe_poses, learned_unit
+from slam.frontend.keyframes.submaps import parts_of
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -24,7 +25,7 @@ def cameras() -> FloatArray:
     return from_rotation_vector(np.outer(yaw, [0.0, 1.0, 0.0]), centres)
 
 
-def walked(unit_after: float, learned_sigma: float) -> MapSegment:
+def walked(unit_after: float, learned_sigma: float) -> LocalMap:
     """A map whose unit is another one after the turn, with learned depth that is off by image."""
     rng = np.random.default_rng(0)
     angle, distance = rng.uniform(-0.7, 2.3, 1500), rng.uniform(3, 6, 1500)
@@ -46,28 +47,28 @@ def walked(unit_after: float, learned_sigma: float) -> MapSegment:
         T_map[:3, 3] *= unit_after if is_after else 1.0
         nowhere, nothing = np.zeros((len(tracks), 2)), np.zeros((len(tracks), 32), np.uint8)
         local.add(TrackedKeyframe(index, invert(T_map), tracks, nowhere, nowhere, depth, nothing, None))
-    return MapSegment(local, started=True)
+    return replace(local, started=True)
 
 
-def length(part: MapSegment) -> float:
+def length(part: LocalMap) -> float:
     """Of the way from the first keyframe to the last, in the unit of learned depth."""
-    centre = invert(np.array([keyframe.T_camera_world for keyframe in part.map.keyframes]))[:, :3, 3]
-    return float(np.linalg.norm(centre[-1] - centre[0])) * learned_unit(part.map)
+    centre = invert(np.array([keyframe.T_camera_world for keyframe in part.keyframes]))[:, :3, 3]
+    return float(np.linalg.norm(centre[-1] - centre[0])) * learned_unit(part)
 
 
 @pytest.mark.parametrize("unit_after", [0.85, 1.2])
 def test_a_map_is_cut_where_no_point_carries_the_unit(unit_after: float) -> None:
     segment = walked(unit_after, learned_sigma=0.02)
     before, after = parts_of(segment, CAMERA)
-    assert [k.index for k in after.map.keyframes] == list(range(after.map.keyframes[0].index, 2 * WALK + TURN))
-    assert before.map.keyframes[0].index == 0 and after.map.keyframes[0].index >= WALK
+    assert [k.index for k in after.keyframes] == list(range(after.keyframes[0].index, 2 * WALK + TURN))
+    assert before.keyframes[0].index == 0 and after.keyframes[0].index >= WALK
     assert length(before) == pytest.approx(1.5, rel=0.05) and length(after) == pytest.approx(1.5, rel=0.12)
 
 
 def test_turns_lead_from_one_part_to_the_next() -> None:
     parts = parts_of(walked(0.85, learned_sigma=0.0), CAMERA)
     found, truth = keyframe_poses(parts, CAMERA), cameras()
-    last, first = parts[0].map.keyframes[-1].index, parts[1].map.keyframes[0].index
+    last, first = parts[0].keyframes[-1].index, parts[1].keyframes[0].index
     outside = [pose for pose in found.poses if found.segments[pose.from_index] != found.segments.get(pose.to_index)]
     assert all(found.is_inside(pose) for pose in outside)
     assert {pose.from_index for pose in parts[0].turns} == set(range(last, first))
@@ -80,12 +81,12 @@ def test_turns_lead_from_one_part_to_the_next() -> None:
 def test_keyframes_that_share_no_point_are_in_two_parts() -> None:
     segment = walked(1.0, learned_sigma=0.0)
     middle = WALK // 2
-    local = LocalMap(segment.map.keyframes[:WALK], np.tile(segment.map.points, (2, 1)))
+    local = LocalMap(segment.keyframes[:WALK], np.tile(segment.points, (2, 1)))
     for k in range(middle, WALK):
         keyframe = local.keyframes[k]
         local.keyframes[k] = keyframe.with_corners(np.arange(len(keyframe.track_ids)), keyframe.track_ids + 1500)
-    before, after = parts_of(MapSegment(local, started=True), CAMERA)
-    assert after.map.keyframes[0].index == middle + 1  # where points of the keyframe before have parallax
+    before, after = parts_of(replace(local, started=True), CAMERA)
+    assert after.keyframes[0].index == middle + 1  # where points of the keyframe before have parallax
     by_image, by_points = before.turns
     assert by_image.ends == (middle - 1, middle) and by_points.ends == (middle, middle + 1)
     way = np.linalg.norm(cameras()[middle, :3, 3] - cameras()[middle - 1, :3, 3])
@@ -97,11 +98,11 @@ def test_keyframes_that_share_no_point_are_in_two_parts() -> None:
 
 def test_a_map_whose_points_carry_the_unit_is_one_part() -> None:
     segment = walked(1.0, learned_sigma=0.3)
-    (part,) = parts_of(MapSegment(LocalMap(segment.map.keyframes[:WALK], segment.map.points), started=True), CAMERA)
-    assert [keyframe.index for keyframe in part.map.keyframes] == list(range(WALK)) and not part.turns
+    (part,) = parts_of(LocalMap(segment.keyframes[:WALK], segment.points, started=True), CAMERA)
+    assert [keyframe.index for keyframe in part.keyframes] == list(range(WALK)) and not part.turns
 
 
 def test_a_map_of_one_keyframe_is_one_part() -> None:
     segment = walked(1.0, learned_sigma=0.3)
-    alone = MapSegment(LocalMap(segment.map.keyframes[:1], segment.map.points), started=True)
-    assert [len(part.map.keyframes) for part in parts_of(alone, CAMERA)] == [1]
+    alone = LocalMap(segment.keyframes[:1], segment.points, started=True)
+    assert [len(part.keyframes) for part in parts_of(alone, CAMERA)] == [1]

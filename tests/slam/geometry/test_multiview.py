@@ -1,4 +1,7 @@
-"""Perspective-n-point: a known camera is found among outliers, its sigmas hold, and seeds vary the draws."""
+"""Perspective-n-point: a known camera is found among outliers, its sigmas hold, and seeds vary the draws.
+
+Two-view geometry of drawn points with a known motion.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,29 @@ from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.geometry import se3
-from slam.geometry.resection import consensus, pixel_jacobian, ransac_order, resect
+from slam.geometry.multiview import (
+    UnitRelativePose,
+    consensus,
+    depth_in_current,
+    parallax_px,
+    pixel_jacobian,
+    ransac_order,
+    resect,
+    rotation_between,
+    triangulated_depth,
+    unit_pose_by_essential,
+    unit_pose_by_pnp,
+)
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, is_se3, rotation_angle
 
 K = np.array([[240.0, 0.0, 160.0], [0.0, 240.0, 60.0], [0.0, 0.0, 1.0]])
 T_CAMERA_POINTS = se3.from_rotation_vector(np.array([0.02, -0.05, 0.01]), np.array([0.1, -0.05, -0.8]))
 INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 T_TRUE = from_rotation_vector(np.array([0.1, -0.2, 0.3]), np.array([0.2, 0.1, -0.3]))
+FOCAL_PX = 240.0
+LENGTH = 0.8
+T_CURRENT_PREVIOUS = se3.from_rotation_vector(np.deg2rad([0.3, -2.0, 0.2]), LENGTH * np.array([0.28, 0.0, -0.96]))
+UNIT_POSE = UnitRelativePose(T_CURRENT_PREVIOUS[:3, :3], T_CURRENT_PREVIOUS[:3, 3] / LENGTH)
 
 
 def scene(seed: int, noise_px: float = 0.3, outliers: int = 30) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -32,9 +51,7 @@ def scene(seed: int, noise_px: float = 0.3, outliers: int = 30) -> tuple[FloatAr
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_given(seed: int) -> None:
     points, pixels, is_inlier = scene(5)
-    found = consensus(points, pixels, K, 200, 2.0, seed)
-    assert found is not None
-    T_start, inliers = found
+    T_start, inliers = consensus(points, pixels, K, 200, 2.0, seed)
     assert set(inliers) <= set(np.flatnonzero(is_inlier)) and len(inliers) > 60
     resection = resect([T_start], points[inliers], pixels[inliers], K)
     error = se3.invert(T_CAMERA_POINTS) @ resection.T_camera_world
@@ -45,17 +62,16 @@ def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_giv
 def test_pixels_without_a_common_camera_have_none() -> None:
     points, _, _ = scene(0)
     pixels = np.random.default_rng(1).uniform(0.0, 300.0, (100, 2))
-    found = consensus(points, pixels, K, 200, 0.5)
-    assert found is None or len(found[1]) < 12
+    _, inliers = consensus(points, pixels, K, 200, 0.5)
+    assert len(inliers) < 12
 
 
 def test_sigmas_are_those_of_the_errors_of_refined_cameras() -> None:
     whitened = []
     for seed in range(60):
         points, pixels, _ = scene(seed, noise_px=0.5, outliers=0)
-        found = consensus(points, pixels, K, 200, 3.0)
-        assert found is not None
-        resection = resect([found[0]], points[found[1]], pixels[found[1]], K)
+        T_start, inliers = consensus(points, pixels, K, 200, 3.0)
+        resection = resect([T_start], points[inliers], pixels[inliers], K)
         error = resection.T_camera_world @ se3.invert(T_CAMERA_POINTS)
         shift = error[:3, 3]
         turned = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]) / 2
@@ -148,3 +164,69 @@ def test_the_majority_is_not_the_world_where_others_have_the_vote() -> None:
     pose = resect((T_TRUE, T_moved), points, pixels, INTRINSICS.K, trusted=trusted)
     np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-6)
     assert (pose.residual_px[~trusted] > 3.0).all()
+
+
+def matched_rays(noise_px: float = 0.0, outliers: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rays ``(120, 3)`` in both cameras, the first ``outliers`` of them wrong, and the depths in the earlier one."""
+    rng = np.random.default_rng(0)
+    previous = np.column_stack([rng.uniform(-0.8, 0.8, 120), rng.uniform(-0.25, 0.25, 120), np.ones(120)])
+    depth = rng.uniform(4.0, 30.0, 120)
+    moved = se3.apply(T_CURRENT_PREVIOUS, previous * depth[:, None])
+    current = moved / moved[:, 2:]
+    current[:, :2] += noise_px / FOCAL_PX * rng.normal(size=(120, 2))
+    current[:outliers, :2] += rng.uniform(0.1, 0.3, (outliers, 2))
+    return previous, current, depth
+
+
+def degrees_between(found: UnitRelativePose) -> tuple[float, float]:
+    """Errors of rotation and direction."""
+    cosine = float(np.clip(found.direction @ UNIT_POSE.direction, -1.0, 1.0))
+    rotation = se3.rotation_angle(found.R_current_previous.T @ UNIT_POSE.R_current_previous)
+    return float(np.rad2deg(rotation)), float(np.rad2deg(np.arccos(cosine)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 7])
+def test_both_consensus_methods_find_the_motion_among_outliers(seed: int) -> None:
+    previous, current, depth = matched_rays(noise_px=0.1, outliers=30)
+    depth[::9] = np.nan
+    tolerance = 1.0 / FOCAL_PX
+    for found in (
+        unit_pose_by_essential(previous, current, tolerance, seed),
+        unit_pose_by_pnp(previous, current, depth, 2.0 * tolerance, seed),
+    ):
+        assert found is not None
+        rotation_deg, direction_deg = degrees_between(found)
+        assert rotation_deg < 0.5 and direction_deg < 10.0  # of minimal samples, to be refined
+
+
+def test_too_few_points_have_no_motion() -> None:
+    previous, current, depth = matched_rays()
+    assert unit_pose_by_pnp(previous, current, np.where(np.arange(120) < 7, depth, np.nan), 1e-2) is None
+
+
+def test_depths_are_triangulated_in_both_cameras() -> None:
+    previous, current, depth = matched_rays()
+    found = triangulated_depth(previous, current, UNIT_POSE)
+    np.testing.assert_allclose(found * LENGTH, depth, rtol=1e-9)
+    in_current = se3.apply(T_CURRENT_PREVIOUS, previous * depth[:, None])[:, 2]
+    np.testing.assert_allclose(depth_in_current(previous, found, UNIT_POSE) * LENGTH, in_current, rtol=1e-9)
+    backwards = UnitRelativePose(UNIT_POSE.R_current_previous, -UNIT_POSE.direction)
+    assert (triangulated_depth(previous, current, backwards) < 0).all()
+
+
+def test_parallax_is_the_flow_without_that_of_the_rotation() -> None:
+    previous, _, _ = matched_rays()
+    rotated = previous @ UNIT_POSE.R_current_previous.T
+    rotated /= rotated[:, 2:]
+    assert parallax_px(previous, rotated, UNIT_POSE.R_current_previous, (FOCAL_PX, FOCAL_PX)).max() < 1e-9
+    shifted = rotated + np.array([3.0, 4.0, 0.0]) / FOCAL_PX
+    np.testing.assert_allclose(parallax_px(previous, shifted, UNIT_POSE.R_current_previous, (FOCAL_PX, FOCAL_PX)), 5.0)
+
+
+def test_a_pure_rotation_is_found_with_a_fifth_of_outliers() -> None:
+    previous, _, _ = matched_rays()
+    rotated = previous @ UNIT_POSE.R_current_previous.T
+    rotated /= rotated[:, 2:]
+    rotated[:24, :2] += 0.05
+    found = rotation_between(previous, rotated)
+    assert np.rad2deg(se3.rotation_angle(found.T @ UNIT_POSE.R_current_previous)) < 1e-6

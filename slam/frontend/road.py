@@ -1,4 +1,4 @@
-"""The length of a step in camera heights, by the homography of the road between two images.
+"""The road: the length of a step in camera heights by its homography, and the ground plane fitted to learned depth.
 
 A plane ``n . X = h`` of the current camera maps to the previous one by the homography ``R + t n^T / h``
 (Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known from corners; the vector
@@ -8,6 +8,9 @@ not used, so this length has neither the bias nor the drift of the networks.
 Brightness that changes slowly over the image (light, reflections) is removed from the difference of the images.
 Taken from each image before, it would not be the same part of the road in both, for the road is larger in the later
 one: lengths came out 1 % short.
+
+With the plane ``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
+ray, and the ray has no noise, so errors of depth do not bias the fit as they bias a fit to points.
 """
 
 from __future__ import annotations
@@ -20,8 +23,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
 from slam.frontend.visual.motion import Steps, links, triangulated
+from slam.frontend.visual.self_calibration import DepthError
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, path_distance
 from slam.runtime.errors import Failed
@@ -48,6 +52,16 @@ _REACH_HEIGHTS = 2.5  # of the path before and after a frame, in camera heights:
 _USUAL_STEPS = 101  # whose median direction is the usual one
 _PITCH_SIGMA_DEG = 0.3  # of a car against its usual pitch, degrees
 _OF_PATH = 0.5  # noise of the path's direction over that of a single step
+_PLANE_POINTS = 1500
+_LEAST_POINTS = 50
+_HYPOTHESES = 150
+_REWEIGHTINGS = 8
+_ROAD_ROWS = 0.35, 0.97  # top and bottom edge of the road, from horizon (0) to image bottom (1): above a bonnet
+_ROAD_TOP_WIDTH = 0.16  # width of the top edge over that of the image
+_ROAD_BOTTOM_WIDTH = 0.5  # width of the bottom edge over that of the image
+_MAX_PLANE_TILT_DEG = 12.0  # largest angle between the plane's normal and the camera's y axis, degrees
+_INLIER_RELATIVE_DEPTH = 0.05  # largest relative depth error of a plane inlier
+_MIN_INLIER_RATIO = 0.5  # least inlier ratio of a usable frame
 
 
 @dataclass(frozen=True)
@@ -146,7 +160,12 @@ class RoadHomography:
 
         def filtered() -> list[_Layer]:
             grey = frame.grey[self._top_row :].astype(np.float32)
-            local = grey - _gradual(grey, _gradual_px(self._intrinsics))
+            # what changes slowly, by a blur that is computed in a smaller image where it is wide
+            sigma_px = _gradual_px(self._intrinsics)
+            ratio = max(int(sigma_px) // 2, 1)
+            size = max(grey.shape[1] // ratio, 1), max(grey.shape[0] // ratio, 1)
+            small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio)
+            local = grey - np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
             coarse = cv2.GaussianBlur(local, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
             return [np.asarray(cv2.merge([layer, *slopes_of(layer)])) for layer in (coarse, grey)]
 
@@ -309,14 +328,6 @@ def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, leng
     return np.asarray(np.linalg.solve(information + prior + 1e-9 * np.eye(3), right))
 
 
-def _gradual(grey: _Layer, sigma_px: float) -> _Layer:
-    """What changes slowly over an image, by a blur that is computed in a smaller image where it is wide."""
-    ratio = max(int(sigma_px) // 2, 1)
-    size = max(grey.shape[1] // ratio, 1), max(grey.shape[0] // ratio, 1)
-    small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio)
-    return np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
-
-
 def _gradual_px(intrinsics: Intrinsics) -> float:
     """Sigma of the blur that leaves what changes slowly over the image, in pixels."""
     return max(0.01 * intrinsics.fx, 1.5)
@@ -335,3 +346,89 @@ def _ahead(points: _Layer) -> _Layer:
 
 def _correlation(a: _Layer, b: _Layer) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
+
+
+class GroundPlaneFitter:
+    """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
+
+    def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
+        """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
+        self._seed = seed
+        # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a level camera)
+        horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
+        top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
+        area = intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
+        step = max(1.0, float(np.sqrt(max(area, 1.0) / _PLANE_POINTS)))
+        rows_seen = np.unique(np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64))
+        rows, columns = [], []
+        for row in rows_seen:
+            share = (row - top_row) / (bottom_row - top_row)
+            width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
+            half = width * intrinsics.width / 2
+            across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
+            across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
+            columns.append(across)
+            rows.append(np.full(len(across), row))
+        empty = [np.empty(0, dtype=np.int64)]
+        v, u = np.concatenate(rows or empty), np.concatenate(columns or empty)
+        self._rows, self._columns, self._rays = v, u, intrinsics.rays(np.stack([u, v], axis=-1))
+
+    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | Failed:
+        """The camera's unscaled height over the plane of learned z-depth ``(H, W)`` without the bias by its ``error``.
+
+        The depth is at the size of the intrinsics; where it is unknown it is left out.
+        """
+        depth = error.corrected(depth_unscaled[self._rows, self._columns].astype(np.float64))
+        inverse_depth = 1.0 / np.maximum(depth, 1e-9)
+        usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
+        if usable.sum() < _LEAST_POINTS:
+            return Failed("the depth in front of the car is not usable")
+        rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
+        scaled_normal = _ransac(rays, inverse_depth, self._seed)
+        if scaled_normal is None:
+            return Failed(f"no plane within {_MAX_PLANE_TILT_DEG:g} deg of level in front of the car")
+        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
+        height = 1.0 / float(np.linalg.norm(scaled_normal))
+        inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
+        if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)):
+            return Failed(f"the plane in front of the car is tilted by more than {_MAX_PLANE_TILT_DEG:g} deg")
+        if inlier_ratio < _MIN_INLIER_RATIO:
+            return Failed(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
+        return height
+
+
+def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArray | None:
+    """``n / h`` ``(3,)`` of the level plane with most inliers, or None."""
+    rng = np.random.default_rng(seed)
+    samples = rng.integers(len(rays), size=(_HYPOTHESES, 3))
+    minimal = rays[samples]  # (S, 3, 3)
+    solvable = np.abs(np.linalg.det(minimal)) > 1e-6
+    if not solvable.any():
+        return None
+    planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[..., 0]  # (S, 3)
+    level = planes[:, 1] > np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)) * np.linalg.norm(planes, axis=1)
+    if not level.any():
+        return None
+    planes = planes[level]
+    votes = _inliers(rays, inverse_depth, planes).sum(axis=1)
+    best: FloatArray = planes[votes.argmax()]
+    return best
+
+
+def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> NDArray[np.bool_]:
+    """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
+    over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
+    relative = planes.astype(np.float32) @ over_measured
+    relative -= 1.0
+    return np.asarray(np.abs(relative, out=relative) < _INLIER_RELATIVE_DEPTH)
+
+
+def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray) -> FloatArray:
+    """Refine ``n / h`` by least squares with Cauchy weights on the relative error of inverse depth."""
+    for _ in range(_REWEIGHTINGS):
+        predicted = np.maximum(rays @ plane, 1e-9)
+        residual = inverse_depth / predicted - 1.0
+        weights = 1.0 / (predicted**2 * (1.0 + (residual / (0.5 * _INLIER_RELATIVE_DEPTH)) ** 2))
+        weighted = rays * weights[:, None]
+        plane = np.linalg.solve(weighted.T @ rays, weighted.T @ inverse_depth)
+    return plane

@@ -1,0 +1,255 @@
+"""Maps of keyframes cut into parts through each of which points carry one unit, and maps of one drive joined.
+
+A camera that turns on the spot sees new points with hardly any parallax. The map goes on with learned depth, whose unit
+may be a tenth off, and every point fits. So it is cut there, and each part has the unit of learned depth or the floor.
+
+Joined maps are brought into one world, tracks of the same corner made one, all keyframes adjusted.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
+from slam.frontend.keyframes.local_map import (
+    OUTLIER_PX,
+    LocalMap,
+    Parallax,
+    TrackedFrame,
+    TrackedKeyframe,
+    TrackIds,
+)
+from slam.frontend.keyframes.relative_poses import learned_units
+from slam.geometry.multiview import MIN_POINTS
+from slam.geometry.se3 import FloatArray, apply, chain, invert
+
+_PIXEL_SIGMA = 0.5  # of a sighting, pixels
+_POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
+_INDEPENDENT = 10  # points with independent errors that those of a keyframe are worth: all share its pose
+# sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and between two of one part
+_BEGUN, _CARRIED = 0.03, 0.05
+_TURNED, _UNKNOWN = 0.05, 0.5  # the most by points without parallax, and where keyframes share few points
+_DRIFT = 0.2  # of the sigma of one carry, that adds up along a map: what one keyframe lacks, the next ones see
+_LEAST_KEYFRAMES = 4  # of a part
+_IMAGE_ROTATION, _IMAGE_LENGTH = np.deg2rad(0.5), 0.03  # sigmas of a turn of the whole image, radians and depths
+_ROTATION, _LENGTH = np.deg2rad(0.1), 0.01  # least sigmas by points without parallax, radians and depths
+_DEPTH_SIGMA = 0.2  # of a length by learned depth, over it
+logger = logging.getLogger(__name__)
+
+# outliers are taken out at these multiples of their limit, from a start that is still off by the drift
+_OUTLIER_LIMITS = (4.0, 2.0, 1.0)
+_LIMITS = 20, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
+
+
+# rows of an earlier and of a later keyframe, and of the corners of both that are one point (M, 2)
+Shared = tuple[int, int, NDArray[np.intp]]
+
+
+def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
+    """The parts of a map in time order; the map itself where no part has enough keyframes.
+
+    Motions to keyframes and frames outside the parts, and to the next part, are ``turns`` of the part before, those
+    before the first part its own.
+    """
+    keyframes = segment.keyframes
+    shared = np.array([len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in pairwise(keyframes)])
+    tied = shared >= MIN_POINTS
+    sigmas = _sigmas(segment, intrinsics)
+    along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
+    segment = _held(segment, np.where(tied, along, _UNKNOWN))
+    keyframes = segment.keyframes
+    begun, carries = np.flatnonzero(sigmas < _BEGUN), sigmas < _CARRIED
+    carries[: begun[0] if len(begun) else None] = True  # before points have parallax
+    number = np.concatenate([[0], np.cumsum(~(carries & tied))])
+    # the median way of the camera from frame to frame between keyframes that points tie; 0 without any
+    paces = [
+        np.linalg.norm((a.T_camera_world @ invert(b.T_camera_world))[:3, 3]) / (b.index - a.index)
+        for (a, b), is_tied in zip(pairwise(keyframes), tied, strict=True)
+        if is_tied
+    ]
+    pace = float(np.median(paces)) if paces else 0.0
+    runs = [rows for n in range(number[-1] + 1) if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES]
+    if not runs:
+        return [segment]
+    parts = [LocalMap([keyframes[k] for k in rows], segment.points, [], True) for rows in runs]
+    part = np.full(len(keyframes), -1)
+    for n, rows in enumerate(runs):
+        part[rows] = n
+    before = np.maximum.accumulate(part).clip(min=0)
+    for k in range(1, len(keyframes)):
+        if part[k] < 0 or part[k] != part[k - 1]:
+            to_next = keyframes[k].index, keyframes[k].T_camera_world
+            parts[before[k - 1]].turns.append(_turn(keyframes[k - 1], *to_next, None if tied[k - 1] else pace))
+    starts = np.array([keyframe.index for keyframe in keyframes])
+    for frame in segment.frames:
+        k = int(np.searchsorted(starts, frame.index, side="right")) - 1
+        if part[k] >= 0:
+            parts[part[k]].frames.append(frame)
+        elif frame.T_camera_world is not None and frame.index != starts[k]:
+            parts[before[k]].turns.append(_turn(keyframes[k], frame.index, frame.T_camera_world))
+    for piece in parts:
+        piece.turns.sort(key=lambda turn: turn.to_index)
+    return parts
+
+
+def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:
+    """The map in the unit of learned depth, which holds its unit in the long run, and learned depth in the map's."""
+    units, corrections = learned_units(segment, carried)
+    T = segment.T_world_camera
+    steps = invert(T[:-1]) @ T[1:]
+    steps[:, :3, 3] *= np.sqrt(units[:-1] * units[1:])[:, None]
+    held = moved(segment, chain(steps), units)
+    pairs = zip(held.keyframes, corrections, strict=True)
+    held.keyframes = [replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs]
+    return held
+
+
+def _turn(keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, pace: float | None = None) -> RelativePose:
+    """From a keyframe to a later camera in the unit of learned depth.
+
+    Where no points lead there, but the whole image, it is a turn of unknown small length, whatever later adjustments
+    made of it: at most some way at the camera's ``pace`` by frame.
+    """
+    T = keyframe.T_camera_world @ invert(T_camera_world)
+    learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
+    depth = float(np.median(learned)) if len(learned) else 1.0
+    if pace is None:
+        sigmas = _ROTATION, _LENGTH * depth + _DEPTH_SIGMA * float(np.linalg.norm(T[:3, 3]))
+    else:
+        T[:3, 3] = 0.0
+        sigmas = _IMAGE_ROTATION, _IMAGE_LENGTH * depth + pace * (index - keyframe.index)
+    return RelativePose(keyframe.index, index, T, np.repeat(sigmas, 3), KEYFRAME_SOURCE)
+
+
+def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
+    """Sigmas of the logarithm of the unit as points carry it from each keyframe to the next ``(K - 1,)``.
+
+    A point carries it by its parallax between the first camera that saw it and those up to the earlier keyframe.
+    """
+    parallax = Parallax(local.points)
+    pixel = _PIXEL_SIGMA / intrinsics.fx
+    sigmas = []
+    for keyframe in local.keyframes:
+        tracks = keyframe.track_ids[local.known(keyframe.track_ids)]
+        depth_sigmas = np.maximum(pixel / np.maximum(parallax.angle[tracks], 1e-6), _POINT_SIGMA)
+        sigmas.append(1.0 / np.sqrt(max(_INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1), 1e-9)))
+        parallax.see(keyframe.T_camera_world, tracks)
+    return np.array(sigmas[1:])
+
+
+def join(
+    segments: Sequence[LocalMap],
+    T_world_camera: FloatArray,
+    scales: FloatArray,
+    shared: Sequence[Shared],
+    intrinsics: Intrinsics,
+) -> tuple[LocalMap, list[float]]:
+    """One map of several, or of one with loops; the segments stay as they are.
+
+    Args:
+        segments: in time order, started.
+        T_world_camera: of all their keyframes in one world ``(K, 4, 4)``.
+        scales: units of that world per unit of each keyframe's own map ``(K,)``.
+        shared: corners of keyframes.
+        intrinsics: of all images.
+
+    Returns:
+        The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
+    """
+    ends = np.cumsum([len(segment.keyframes) for segment in segments])[:-1]
+    parts = zip(segments, np.split(T_world_camera, ends), np.split(scales, ends), strict=True)
+    united = _united([moved(*part) for part in parts])
+    keyframes = united.keyframes
+    tracks = _merged_tracks(keyframes, len(united.points), shared)
+    joined = _renumbered(united, tracks)
+    everything = range(len(keyframes))
+    for limit in _OUTLIER_LIMITS:
+        sightings, track_ids = joined.sightings(everything, np.isfinite(joined.points[:, 0]), intrinsics)
+        gone, _ = joined.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
+        outliers = sum(map(len, gone))
+        logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)
+    kept_ratios = []
+    for earlier, later, corners in shared:
+        seen = [
+            np.isin(tracks[keyframes[row].track_ids[rows]], joined.keyframes[row].track_ids)
+            for row, rows in zip((earlier, later), corners.T, strict=True)
+        ]
+        kept_ratios.append(float(np.mean(seen[0] & seen[1])))
+    return joined, kept_ratios
+
+
+def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> LocalMap:
+    """A map by new poses ``(K, 4, 4)`` and units ``(K,)`` of its keyframes.
+
+    Points follow the first keyframe that sees them, frames the last keyframe before them.
+    """
+    points = np.full_like(segment.points, np.nan)
+    for keyframe, T, scale in reversed(list(zip(segment.keyframes, T_world_camera, scales, strict=True))):
+        points_camera = apply(keyframe.T_camera_world, segment.points[keyframe.track_ids])
+        points[keyframe.track_ids] = apply(T, scale * points_camera)
+    T_camera_world = invert(T_world_camera)
+    keyframes = [replace(k, T_camera_world=T) for k, T in zip(segment.keyframes, T_camera_world, strict=True)]
+    indices = np.array([keyframe.index for keyframe in keyframes])
+    frames = []
+    for frame in segment.frames:
+        row = max(int(np.searchsorted(indices, frame.index, side="right")) - 1, 0)
+        T_followed = None
+        if frame.T_camera_world is not None:
+            T_frame_keyframe = frame.T_camera_world @ invert(segment.keyframes[row].T_camera_world)
+            T_frame_keyframe[:3, 3] *= scales[row]
+            T_followed = T_frame_keyframe @ T_camera_world[row]
+        frames.append(replace(frame, T_camera_world=T_followed))
+    return LocalMap(keyframes, points, frames, segment.started, segment.turns)
+
+
+def _united(segments: Sequence[LocalMap]) -> LocalMap:
+    """The maps in one, with tracks numbered one map after the other."""
+    keyframes: list[TrackedKeyframe] = []
+    frames: list[TrackedFrame] = []
+    first = 0
+    for segment in segments:
+        keyframes += [replace(keyframe, track_ids=keyframe.track_ids + first) for keyframe in segment.keyframes]
+        frames += [replace(frame, track_ids=frame.track_ids + first) for frame in segment.frames]
+        first += len(segment.points)
+    points = np.concatenate([segment.points for segment in segments])
+    turns = [turn for segment in segments for turn in segment.turns]
+    return LocalMap(keyframes, points, frames, True, turns)
+
+
+def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[Shared]) -> TrackIds:
+    """For each track the first one of the same point ``(count,)``; a keyframe never sees a point twice."""
+    first = np.arange(count)
+    members: dict[int, list[int]] = {}
+    seen_by: dict[int, set[int]] = {}
+    for row, keyframe in enumerate(keyframes):
+        for track in keyframe.track_ids.tolist():
+            seen_by.setdefault(track, set()).add(row)
+    for earlier, later, corners in sorted(shared, key=lambda pair: -len(pair[2])):
+        tracks_earlier = keyframes[earlier].track_ids[corners[:, 0]]
+        tracks_later = keyframes[later].track_ids[corners[:, 1]]
+        for a, b in zip(first[tracks_earlier].tolist(), tracks_later.tolist(), strict=True):
+            one, other = sorted((int(first[a]), int(first[b])))
+            if one == other or seen_by[one] & seen_by[other]:
+                continue
+            seen_by[one] |= seen_by[other]
+            members.setdefault(one, [one]).extend(members.pop(other, [other]))
+            first[members[one]] = one
+    return first
+
+
+def _renumbered(segment: LocalMap, tracks: TrackIds) -> LocalMap:
+    keyframes = []
+    for keyframe in segment.keyframes:
+        merged = tracks[keyframe.track_ids]
+        keyframes.append(keyframe.with_corners(np.argsort(merged), merged))
+    points = segment.points.copy()
+    lonely = np.flatnonzero(np.isnan(points[tracks, 0]) & np.isfinite(points[:, 0]))
+    points[tracks[lonely]] = points[lonely]
+    frames = [replace(frame, track_ids=tracks[frame.track_ids]) for frame in segment.frames]
+    return LocalMap(keyframes, points, frames, True, segment.turns)

@@ -1,1 +1,0 @@
-"""Lengths of steps and their unit: ground plane, road homography, triangulated points."""

@@ -8,6 +8,8 @@ DOCS := .venv-docs
 TORCH_INDEX ?=
 
 export OMP_WAIT_POLICY ?= PASSIVE
+# The tests start some hundred processes: the first one writes the bytecode that the others read
+export PYTHONDONTWRITEBYTECODE :=
 
 # Writes requirements.lock with `make lock`; a program, not a part of the environment
 UV ?= uv

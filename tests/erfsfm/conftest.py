@@ -154,9 +154,8 @@ _CONFIGURATIONS = {
 
 @pytest.fixture(
     params=[
-        pytest.param(
-            name, marks=pytest.mark.slow if re.match("table[12]|erf-|default-gpu", name) else ()
-        )  # table 3 has both networks
+        # a row of table 3 has both networks of the paper
+        pytest.param(name, marks=pytest.mark.slow if re.match("table[12]|erf-|default-(gpu|pose)", name) else ())
         for name in _CONFIGURATIONS.values()
     ]
 )

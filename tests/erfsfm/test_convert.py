@@ -167,7 +167,7 @@ def test_depth(tmp_path: Path, pose_file: Path, preset: str, deformable: frozens
     ("preset", "deformable", "dilated", "masks", "sources"),
     [
         pytest.param("posenet", PLAIN, PLAIN, False, 4, marks=pytest.mark.slow),
-        ("erf-posenet-dilated", PLAIN, DILATED, True, 2),
+        pytest.param("erf-posenet-dilated", PLAIN, DILATED, True, 2, marks=pytest.mark.slow),
         ("erf-posenet-dfc", {3, 4, 5, 6, 7}, PLAIN, False, 4),
         pytest.param("erf-posenet-dfcv2", {1, 2, 3, 4}, PLAIN, True, 2, marks=pytest.mark.slow),
     ],

@@ -97,6 +97,7 @@ def test_a_network_guesses_in_training_and_measures_afterwards() -> None:
     assert errors_deg(guess, TURNS).max() > 2 and errors_deg(measured, TURNS).max() < 0.1
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_its_graph_has_the_same_outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))

@@ -38,7 +38,7 @@ def test_theoretical(name, fidelity, wanted):
     "name, fidelity, offsets_px",
     [
         ("posenet", "default", 0.0),
-        ("erf-posenet-dilated", "default", 0.0),
+        pytest.param("erf-posenet-dilated", "default", 0.0, marks=pytest.mark.slow),
         pytest.param("erf-posenet-dilated", "paper", 0.0, marks=pytest.mark.slow),
         pytest.param("erf-posenet-dfc", "default", 1.0, marks=pytest.mark.slow),
         pytest.param("erf-posenet-dfcv2", "default", 0.5, marks=pytest.mark.slow),

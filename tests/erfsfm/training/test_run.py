@@ -241,8 +241,8 @@ def saved(config: ExperimentConfig, networks: TrainedNetworks, folder: Path) -> 
     ("networks", "steps"),
     [
         ("both", {".": 2, "best_pose": 3, "last": 4}),
-        ("pose", {".": 3, "best_pose": 3, "last": 4}),
-        ("depth", {".": 2, "last": 4}),
+        pytest.param("pose", {".": 3, "best_pose": 3, "last": 4}, marks=pytest.mark.slow),
+        pytest.param("depth", {".": 2, "last": 4}, marks=pytest.mark.slow),
     ],
 )
 def test_best_depth_and_best_pose_are_kept_apart(

@@ -175,6 +175,7 @@ def test_among_the_images_the_picture_is_none_of_them(tmp_path: Path, calibrate:
     assert photo.read_bytes() == b"what the camera looks like"
 
 
+@pytest.mark.slow
 def test_a_video_gives_its_rate(tmp_path: Path, calibrate: Call) -> None:
     studio = Studio(distortion=(0.0,) * 5)
     path = tmp_path / "board.avi"
@@ -195,7 +196,12 @@ def test_a_video_gives_its_rate(tmp_path: Path, calibrate: Call) -> None:
         ("frontal", [], "all 9 views are frontal .*do not determine the focal length; tilt it by 20 to 45"),
         ("few", [], "3 of 3 images show the whole 9x6 chessboard, 8 are needed: take 20 or more"),
         ("outside", [], "0 of 4 images show the whole 9x6 chessboard.*with all of the board in them"),
-        ("tilted", ["--board", "8x6"], "[012] of 4 images show the whole 8x6 chessboard.*counts the corners between"),
+        pytest.param(
+            "tilted",
+            ["--board", "8x6"],
+            "[012] of 4 images show the whole 8x6 chessboard.*counts the corners",
+            marks=pytest.mark.slow,
+        ),
         ("far", [], "was seen in .* % of the image alone|leave the focal length uncertain"),
         ("tilted", ["--board", "nine"], "--board nine is no board"),
         ("tilted", ["--pattern", "charuco", "--dictionary", "9X9_1"], "--dictionary 9X9_1 is none of OpenCV's"),

@@ -158,7 +158,7 @@ def files_of(run: RunFolder, kind: str = "tum") -> tuple[Path, Path]:
     return run.path / f"trajectory_optimised.{kind}.txt", run.path / f"reference.{kind}.txt"
 
 
-@pytest.mark.parametrize("kind", ["tum", "kitti"])
+@pytest.mark.parametrize("kind", ["tum", pytest.param("kitti", marks=pytest.mark.slow)])
 def test_evaluate_files(call: Call, make_run: MakeRun, kind: str) -> None:
     estimate, reference = files_of(make_run(), kind)
     code, out, _ = call("evaluate", estimate, reference, "--json")
@@ -231,6 +231,7 @@ def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run:
         assert call(*words, "--seed", 3, "--device", "cpu")[0] == 0
 
 
+@pytest.mark.slow
 def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
     run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
     assert call(*run)[0] == 0
@@ -245,6 +246,7 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
     assert code == 1 and "is a file of a run" in err and Path("run/reference.tum.txt").read_bytes() == reference
 
 
+@pytest.mark.slow
 def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> None:
     size = ("--width", 104, "--height", 32, "--frames", 8, "--route", "straight", "--seed", 1003)
     code, out, err = call("simulate", "world", *size, "--depth", "--lidar", "--hazards", "rain,exposure")

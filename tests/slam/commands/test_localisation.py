@@ -160,7 +160,7 @@ def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, albu
         assert found.T_world_camera is None and "the image is 312x96, its camera 156x48: give" in found.reason
 
 
-@pytest.mark.parametrize("what", ["another street", "noise", "black"])
+@pytest.mark.parametrize("what", ["another street", "black", pytest.param("noise", marks=pytest.mark.slow)])
 def test_images_of_other_places_are_refused(what: str) -> None:
     images = {
         "another street": [street(seed).frame(k).image for seed, k in ((631, 5), (632, 40))],

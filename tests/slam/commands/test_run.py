@@ -261,7 +261,9 @@ def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str,
         assert contents(output) == before
 
 
-@pytest.mark.parametrize("stage", ["loops", "graph", "map", "report"])
+@pytest.mark.parametrize(
+    "stage", ["graph", "map", *(pytest.param(stage, marks=pytest.mark.slow) for stage in ("loops", "report"))]
+)
 def test_a_stage_that_fails_costs_its_results(
     stage: str,
     quick: dict[str, Any],

@@ -16,7 +16,10 @@ from slam.simulation.street import SimulatedStreet
 
 QUALITIES = range(60, 90, 3)
 STREET = 24  # frames
-HAZARDS = [(), ("exposure", "blur"), pytest.param(("rain", "moving-cars"), marks=pytest.mark.slow)]
+HAZARDS = [
+    (),
+    *(pytest.param(each, marks=pytest.mark.slow) for each in (("exposure", "blur"), ("rain", "moving-cars"))),
+]
 
 
 @functools.cache

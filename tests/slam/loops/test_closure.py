@@ -96,6 +96,7 @@ def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
     assert {"from", "to", "inliers", "score", "reason", "T_from_to"} <= set(details["accepted"][0])
 
 
+@pytest.mark.slow
 def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
     """In a unit of 20 m, where 15 units are longer than the loop, and in one of 5 cm."""
     sequence, result = closed(610)

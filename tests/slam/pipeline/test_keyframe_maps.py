@@ -77,7 +77,7 @@ def completed(observer: Observer) -> Drive:
     return complete_drive(drive, 4, keyframe_poses(drive.maps, room.INTRINSICS))
 
 
-@pytest.mark.parametrize("stands", [False, True])
+@pytest.mark.parametrize("stands", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
     """Before their map begins and over a gap, not beside repeated images: the map tells whether the camera stood."""
     truth, blank, repeated = room.walk(40), (24, 25), (32, 33)
@@ -97,7 +97,9 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
     assert set(drive.interpolated) == {*blank, *(() if stands else repeated)}
 
 
-@pytest.mark.parametrize("interrupted", [(), (19, 21), (20, 22)])
+@pytest.mark.parametrize(
+    "interrupted", [(20, 22), *(pytest.param(frames, marks=pytest.mark.slow) for frames in ((), (19, 21)))]
+)
 def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) -> None:
     """The same ones where the observations are asked for in between."""
     truth = room.walk(40)

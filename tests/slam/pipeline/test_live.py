@@ -224,7 +224,7 @@ class Failing(OraclePredictor):
             raise RuntimeError(f"memory of frame {index} is gone")
 
 
-@pytest.mark.parametrize("following", ["new", "black"])
+@pytest.mark.parametrize("following", ["new", pytest.param("black", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("question", ["depth", "snippet"])
 def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     question: str, following: str, caplog: pytest.LogCaptureFixture

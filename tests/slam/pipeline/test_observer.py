@@ -163,6 +163,7 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
     assert not {view.index for view in seen.views} & set(BAD)
 
 
+@pytest.mark.slow
 def test_frozen_frames_cost_no_more_than_black_ones() -> None:
     assert ate(run_on(repeated_as_jpeg)[0]) < 2 * ate(run_on(black)[0])
 
@@ -194,6 +195,7 @@ def test_rolling_exposure_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     assert "the exposure rolls: " in caplog.text
 
 
+@pytest.mark.slow
 def test_many_gaps_are_counted_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
     bad = range(6, FRAMES - 1, 3)
     run(black, bad, "mapping.enabled=false")

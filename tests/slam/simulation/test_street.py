@@ -151,6 +151,7 @@ def test_scans_lie_on_surfaces_and_spin_freely(straight: SimulatedStreet) -> Non
     assert abs(np.exp(1j * phases[0]) - np.exp(1j * phases[1])) > 0.01
 
 
+@pytest.mark.slow
 def test_kiss_icp_follows_the_scans(straight: SimulatedStreet) -> None:
     config = pytest.importorskip("kiss_icp.config").load_config(None)
     odometry = pytest.importorskip("kiss_icp.kiss_icp").KissICP(config)

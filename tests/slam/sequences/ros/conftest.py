@@ -16,7 +16,6 @@ from rosbags.rosbag2 import StoragePlugin  # noqa: E402
 from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: E402
 
-KINDS = ("ros1", "sqlite", "mcap")
 FIRST_NS, STEP_NS = 1403715273262142976, 50_000_000
 
 
@@ -114,7 +113,7 @@ class BagWriter:
         return self.path
 
 
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=["ros1", "mcap", pytest.param("sqlite", marks=pytest.mark.slow)])
 def kind(request: pytest.FixtureRequest) -> str:
     value: str = request.param
     return value

@@ -95,14 +95,6 @@ class VisualOdometryConfig(Section):
     enabled: bool = Field(default=True, description="measure relative poses by image geometry")
 
 
-class RoadConfig(Section):
-    """Step lengths from the homography of the ground plane, see ``frontend/road.py``."""
-
-    enabled: bool = Field(
-        default=True, description="measure steps by the homography of the ground plane, in camera heights"
-    )
-
-
 class KeyframesConfig(Section):
     """Keyframes with bundle adjustment, see ``frontend/keyframes/odometry.py``."""
 
@@ -223,7 +215,6 @@ class SlamConfig(Section):
     visual_odometry: VisualOdometryConfig = VisualOdometryConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     gaps: GapsConfig = GapsConfig()
-    road: RoadConfig = RoadConfig()
     lidar: LidarConfig = LidarConfig()
     gps: GpsConfig = GpsConfig()
     scale: ScaleConfig = ScaleConfig()

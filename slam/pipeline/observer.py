@@ -270,7 +270,7 @@ class Observer:
         if rotation is not None:
             keep_rotation = self.drive.relative_rotations.append
             self._tasks.append(Task("geometry", self._beside.submit(rotation), keep_rotation))
-        if step is not None and previous is not None and self._config.road.enabled:
+        if step is not None and previous is not None:
             T_previous_current = step.relative_pose.T_from_to
             images = previous.frame, current.frame
             measured = self._beside.submit(self._road.measure, *images, T_previous_current, current.standing)

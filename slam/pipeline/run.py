@@ -309,7 +309,7 @@ class SlamPipeline:
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
         if self._fixes is not None and (by_gps := self._fixes.agreement) is not None:
             by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
-        needs_road = self._config.road.enabled and scale.unit in ("metres", "camera heights")
+        needs_road = scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(drive, self.sequence.intrinsics, scale.contradicted, needs_road)
         if not drive.maps:
             of_images.append(agreement.of_directions(odometry.T_world_camera))

@@ -101,8 +101,9 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("slam.frontend.road._ROAD_ROWS", (0.0, 0.001))  # at the horizon
+    monkeypatch.setattr("slam.frontend.road._MIN_POINTS", 10**6)  # of the homography
     target, messages = filled(street, tmp_path)
-    settings = (*SETTINGS, "road.enabled=false", f"scale.mode={mode}")
+    settings = (*SETTINGS, f"scale.mode={mode}")
     request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     recorded = folder.metrics().tree()["scale"]

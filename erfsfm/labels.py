@@ -241,12 +241,7 @@ def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bo
     return np.asarray((cv2.dilate(under.astype(np.uint8), rim) > 0) & (road > 0))
 
 
-def impose_road(
-    inverse_depth: Array,
-    sigma: Array,
-    reliable: NDArray[np.bool_],
-    road: Array,
-) -> Array:
+def impose_road(inverse_depth: Array, sigma: Array, reliable: NDArray[np.bool_], road: Array) -> Array:
     """Forget what lies under the road and put the road's own depth where an unknown pixel lies on it, both in place.
 
     Args:

@@ -124,10 +124,7 @@ _METRICS = {
 # never null
 _ALWAYS = {"schema", "status", "provenance", "frames", "name", "timing", "mode", "nodes", "factors", *_PROVENANCE}
 _STEMS = ("trajectory_network", "trajectory_odometry", "trajectory_optimised")
-_FILES = (
-    *("config.yaml", "metrics.json", "graph.g2o", "loops.json", "places.npz"),
-    *("report.html", "run.log"),
-)
+_FILES = (*("config.yaml", "metrics.json", "graph.g2o", "loops.json", "places.npz"), *("report.html", "run.log"))
 _MAP_FILES = ("map_mesh.ply", "map_cloud.ply")
 
 

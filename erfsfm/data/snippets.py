@@ -22,14 +22,7 @@ from erfsfm.data.augmentation import as_tensors, depth_alone, single_image, trai
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split import usable
-from erfsfm.data.window import (
-    ArrayCache,
-    Snippet,
-    TeacherStructure,
-    first_readable,
-    load_window,
-    snippet_motion,
-)
+from erfsfm.data.window import ArrayCache, Snippet, TeacherStructure, first_readable, load_window, snippet_motion
 from erfsfm.geometry import Camera
 
 _VALIDATED = 40  # snippets: as many as the shipped weights were chosen by

@@ -114,10 +114,7 @@ def _images(
 
 
 def _points(
-    points_world: FloatArray,
-    colours: NDArray[np.uint8],
-    sightings: Sightings,
-    of_frames: dict[int, NDArray[np.intp]],
+    points_world: FloatArray, colours: NDArray[np.uint8], sightings: Sightings, of_frames: dict[int, NDArray[np.intp]]
 ) -> tuple[list[str], list[bytes]]:
     """A line a point with its track: numbers of images, and of corners in them; and the same in binary form."""
     tracks: dict[int, list[tuple[int, int]]] = {}

@@ -47,10 +47,7 @@ _BLOCK = np.arange(9)
 
 
 def complete_drive(
-    drive: Drive,
-    sources: int,
-    map_poses: KeyframePoses = _NO_MAPS,
-    joins: Sequence[TrackingEvent] = (),
+    drive: Drive, sources: int, map_poses: KeyframePoses = _NO_MAPS, joins: Sequence[TrackingEvent] = ()
 ) -> Drive:
     """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
 

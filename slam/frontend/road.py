@@ -190,13 +190,7 @@ class RoadHomography:
         return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
 
     def _refine(
-        self,
-        strip: _Strip,
-        before: _Layer,
-        now: _Layer,
-        T_unit: FloatArray,
-        plane: FloatArray,
-        expected: FloatArray,
+        self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, plane: FloatArray, expected: FloatArray
     ) -> tuple[RoadStep, float]:
         """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also the correlation of both images."""
         fx, fy, (tx, ty, tz) = self._intrinsics.fx, self._intrinsics.fy, T_unit[:3, 3].tolist()

@@ -120,10 +120,7 @@ class Scale:
 
 
 def find_scale(
-    mode: ScaleMode,
-    camera_height_m: float | None,
-    drive: Drive,
-    lidar_steps: Sequence[RelativePose],
+    mode: ScaleMode, camera_height_m: float | None, drive: Drive, lidar_steps: Sequence[RelativePose]
 ) -> Scale:
     """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps).
 

@@ -193,11 +193,7 @@ class CornerTracker:
         self._next_track_id = 0
 
     def track(
-        self,
-        previous: Frame,
-        current: Frame,
-        predicted_flow: PredictedFlow | None = None,
-        standing: Mask | None = None,
+        self, previous: Frame, current: Frame, predicted_flow: PredictedFlow | None = None, standing: Mask | None = None
     ) -> Tracks:
         """Corners of ``previous`` tracked to ``current``.
 

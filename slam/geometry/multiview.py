@@ -301,10 +301,7 @@ def unit_pose_by_pnp(
 
 
 def parallax_px(
-    rays_previous: FloatArray,
-    rays_current: FloatArray,
-    R_current_previous: FloatArray,
-    focal: tuple[float, float],
+    rays_previous: FloatArray, rays_current: FloatArray, R_current_previous: FloatArray, focal: tuple[float, float]
 ) -> FloatArray:
     """Optical flow of each point in pixels ``(M,)`` without that of the rotation."""
     rotated = rays_previous @ R_current_previous.T

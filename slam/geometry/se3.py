@@ -42,14 +42,7 @@ def rotation_angle(R: FloatArray) -> FloatArray:
 
     The sine comes from the skew part and the cosine from the trace, so neither end loses digits.
     """
-    skew = np.stack(
-        [
-            R[..., 2, 1] - R[..., 1, 2],
-            R[..., 0, 2] - R[..., 2, 0],
-            R[..., 1, 0] - R[..., 0, 1],
-        ],
-        axis=-1,
-    )
+    skew = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
     sine = np.linalg.norm(skew, axis=-1)
     cosine = np.trace(R, axis1=-2, axis2=-1) - 1.0
     angle: FloatArray = np.arctan2(sine, cosine)

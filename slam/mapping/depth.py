@@ -166,10 +166,7 @@ def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:
 def _at_edges(depth: DepthMap, max_step: float) -> Mask:
     """Pixels on either side of a relative depth step, where networks blur depth."""
     edges = np.zeros(depth.shape, dtype=bool)
-    for near, far in (
-        ((slice(None), slice(1, None)), (slice(None), slice(-1))),
-        ((slice(1, None),), (slice(-1),)),
-    ):
+    for near, far in (((slice(None), slice(1, None)), (slice(None), slice(-1))), ((slice(1, None),), (slice(-1),))):
         a, b = depth[near], depth[far]
         step = np.abs(a - b) > max_step * np.minimum(a, b)
         edges[near] |= step

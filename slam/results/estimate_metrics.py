@@ -15,12 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri, fdtri
 
-from erfsfm.evaluation.pose_metrics import (
-    SnippetErrors,
-    snippet_errors,
-    snippet_from_network,
-    snippets_from_trajectory,
-)
+from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippet_from_network, snippets_from_trajectory
 from slam.evaluation.depth import DepthErrors
 from slam.evaluation.map import (
     ERRORS,

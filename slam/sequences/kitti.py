@@ -31,14 +31,7 @@ from slam.sequences.camera_file import DEFAULT_FPS, find_camera_file
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near
-from slam.sequences.recording import (
-    ArrayReader,
-    RecordedSequence,
-    Source,
-    read_stamps,
-    require_stamps,
-    uniform_stamps,
-)
+from slam.sequences.recording import ArrayReader, RecordedSequence, Source, read_stamps, require_stamps, uniform_stamps
 from slam.simulation.world import distances, scene_of
 
 logger = logging.getLogger(__name__)

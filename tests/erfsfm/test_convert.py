@@ -93,11 +93,7 @@ class OldPose(nn.Module):
     """PoseExpNet by the table of its layers, at a quarter of its width."""
 
     def __init__(
-        self,
-        deformable: frozenset[int] = PLAIN,
-        dilated: frozenset[int] = PLAIN,
-        sources: int = 4,
-        masks: bool = False,
+        self, deformable: frozenset[int] = PLAIN, dilated: frozenset[int] = PLAIN, sources: int = 4, masks: bool = False
     ) -> None:
         super().__init__()
         self.sources = sources

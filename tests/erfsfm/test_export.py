@@ -53,10 +53,7 @@ def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
 )
 @pytest.mark.parametrize(
     "settings",
-    [
-        pytest.param({}, marks=pytest.mark.slow),
-        {"normalisation": "batch", "sources": 2, "height": 47, "width": 78},
-    ],
+    [pytest.param({}, marks=pytest.mark.slow), {"normalisation": "batch", "sources": 2, "height": 47, "width": 78}],
     ids=str,
 )
 def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, Any]) -> None:

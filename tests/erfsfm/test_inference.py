@@ -15,9 +15,7 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import Model, build_networks, save_model
 from erfsfm.config import NetworkConfig
-from erfsfm.inference import (
-    DepthPosePredictor,
-)
+from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import DepthInput, ModelRecord
 
 RNG = np.random.default_rng(3)

@@ -33,14 +33,7 @@ from slam.frontend.keyframes.image_turn import (
     small_image,
     turned,
 )
-from slam.frontend.keyframes.local_map import (
-    DEPTH_SIGMA,
-    LocalMap,
-    NewImage,
-    TrackedFrame,
-    TrackedKeyframe,
-    TrackIds,
-)
+from slam.frontend.keyframes.local_map import DEPTH_SIGMA, LocalMap, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.multiview import (

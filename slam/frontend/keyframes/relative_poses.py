@@ -161,12 +161,7 @@ def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, 
 
 
 def _seen_from(
-    local: LocalMap,
-    track_ids: TrackIds,
-    pixels: FloatArray,
-    T_guess: FloatArray,
-    intrinsics: Intrinsics,
-    seed: int,
+    local: LocalMap, track_ids: TrackIds, pixels: FloatArray, T_guess: FloatArray, intrinsics: Intrinsics, seed: int
 ) -> tuple[FloatArray, FloatArray] | None:
     """``T_camera_world`` by the map's points and its sigmas ``(6,)``; None with too few inliers."""
     known = local.known(track_ids)

@@ -17,14 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
-from slam.frontend.keyframes.local_map import (
-    OUTLIER_PX,
-    LocalMap,
-    Parallax,
-    TrackedFrame,
-    TrackedKeyframe,
-    TrackIds,
-)
+from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, Parallax, TrackedFrame, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.relative_poses import learned_units
 from slam.geometry.multiview import MIN_POINTS
 from slam.geometry.se3 import FloatArray, apply, chain, invert

@@ -274,13 +274,7 @@ class VisualOdometry:
         self._points, self._fitted = step.points, tracks.track_ids[two_view.inliers]
 
     def _triangulated(
-        self,
-        ends: Ends,
-        seconds: float,
-        tracks: Tracks,
-        matches: Matches,
-        depth: FloatArray,
-        two_view: TwoViewEstimate,
+        self, ends: Ends, seconds: float, tracks: Tracks, matches: Matches, depth: FloatArray, two_view: TwoViewEstimate
     ) -> Step | None:
         """The step with its length by learned depth, None with too few points for that."""
         rays_previous, rays_current = matches.rays_previous, matches.rays_current

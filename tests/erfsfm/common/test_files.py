@@ -54,10 +54,7 @@ def test_another_image_stays(tmp_path: Path) -> None:
 def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
-        with (
-            FolderLock() as other,
-            pytest.raises(BusyError, match=r"another process writes to .*run: wait"),
-        ):
+        with FolderLock() as other, pytest.raises(BusyError, match=r"another process writes to .*run: wait"):
             other.take(tmp_path / "run")
     with FolderLock() as lock:
         lock.take(tmp_path / "run")

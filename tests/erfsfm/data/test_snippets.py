@@ -321,8 +321,7 @@ def test_nothing_is_in_two_lists(name: str, count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("runs", "frames"),
-    [("3", [3]), ("0:3", [0, 1, 2]), ("0:7:3", [0, 3, 6]), ("0:7:3, 9,11:13", [0, 3, 6, 9, 11, 12])],
+    ("runs", "frames"), [("3", [3]), ("0:3", [0, 1, 2]), ("0:7:3", [0, 3, 6]), ("0:7:3, 9,11:13", [0, 3, 6, 9, 11, 12])]
 )
 def test_runs(runs: str, frames: list[int]) -> None:
     assert Split(test=[f"kitti_raw/a[{runs}]"]).test_frames() == [("kitti_raw/a", frame) for frame in frames]

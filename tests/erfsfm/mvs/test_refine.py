@@ -54,11 +54,7 @@ def road_and_car(position: tuple[float, float, float], frame: float) -> tuple[np
     return image.astype(np.uint8), np.where(car, 8.0, depth).astype(np.float32), car
 
 
-def refined(
-    images: list[np.ndarray],
-    prior: np.ndarray,
-    unit: float = 1.0,
-) -> RefinedDepth:
+def refined(images: list[np.ndarray], prior: np.ndarray, unit: float = 1.0) -> RefinedDepth:
     """The first image, refined by the others at ``POSITIONS``; a metre is so many units."""
     T = np.tile(np.eye(4), (len(POSITIONS), 1, 1))
     T[:, :3, 3] = -unit * np.array(POSITIONS)

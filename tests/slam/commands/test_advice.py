@@ -70,11 +70,7 @@ def every_frame_of_a_camera(folder: Path) -> Case:
     def follow(_: re.Match[str]) -> None:
         assert len(list(StreamedSequence("door", source, camera, 0.2).frames())) == 1
 
-    return (
-        lambda: StreamedSequence("door", source, camera, 0.2, every_frame=True),
-        "leave out --every-frame",
-        follow,
-    )
+    return (lambda: StreamedSequence("door", source, camera, 0.2, every_frame=True), "leave out --every-frame", follow)
 
 
 @pytest.mark.parametrize("case", [decimal_commas, rows_of_other_frames, rate_of_another_video, every_frame_of_a_camera])

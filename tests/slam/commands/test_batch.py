@@ -119,11 +119,7 @@ def test_a_drive_that_needs_too_much_memory_is_ended(kitti_root: Path, tiny_weig
 
 
 def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
-    kitti_root: Path,
-    tiny_weights: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    command_line: CommandLine,
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
 ) -> None:
     here, data = tmp_path / "here", tmp_path / "data"
     shutil.copytree(tiny_weights, here / "mine")

@@ -265,11 +265,7 @@ def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str,
     "stage", ["graph", "map", *(pytest.param(stage, marks=pytest.mark.slow) for stage in ("loops", "report"))]
 )
 def test_a_stage_that_fails_costs_its_results(
-    stage: str,
-    quick: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    stage: str, quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def failing(*_: object, **__: object) -> None:
         raise KeyError(0)

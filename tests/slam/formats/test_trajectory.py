@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam.formats.trajectory import (
-    Trajectory,
-    associate,
-    matching_tolerance_s,
-    read_trajectory,
-    write_kitti,
-    write_tum,
-)
+from slam.formats.trajectory import Trajectory, associate, matching_tolerance_s, read_trajectory, write_kitti, write_tum
 from slam.geometry import se3
 from slam.runtime.errors import TrajectoryError
 
@@ -137,7 +130,7 @@ def test_the_true_poses_of_euroc(tmp_path: Path, header: str) -> None:
     assert read.timed and read.stamps[0] == 1403715273.262142976
     write_tum(tmp_path / "tum.txt", read)
     assert (tmp_path / "tum.txt").read_text().splitlines()[1].split()[4:] == [
-        *("8.000000000e-01", "0.000000000e+00", "0.000000000e+00", "6.000000000e-01"),
+        *("8.000000000e-01", "0.000000000e+00", "0.000000000e+00", "6.000000000e-01")
     ]
 
 

@@ -15,13 +15,7 @@ from oracle import snippets_of
 from scipy.spatial.transform import Rotation
 
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose, SnippetPoses
-from slam.frontend.completion import (
-    INTERPOLATED_SOURCE,
-    find_cuts,
-    find_segments,
-    interpolate_gaps,
-    smooth_rotations,
-)
+from slam.frontend.completion import INTERPOLATED_SOURCE, find_cuts, find_segments, interpolate_gaps, smooth_rotations
 from slam.frontend.drive import Drive, Segment
 from slam.frontend.factors import chain_raw, join_gap_ends
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps

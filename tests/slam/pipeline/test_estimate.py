@@ -25,8 +25,7 @@ def depths(step: float, guess_sigma: float | None, refined: bool = True) -> Call
     frames = [Frame(k, float(k), rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)) for k in range(FRAMES)]
     wall = np.full((32, 64), 2.5, np.float32)
     drive = Drive(
-        keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames],
-        roads=[Failed("no road")] * FRAMES,
+        keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames], roads=[Failed("no road")] * FRAMES
     )
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)

@@ -66,9 +66,7 @@ def test_a_known_camera_height_and_a_setting_choose() -> None:
 
 
 KEYFRAMES_ALONE = SlamConfig(
-    keyframes=KeyframesConfig(use="always"),
-    loops=LoopsConfig(enabled=False),
-    mapping=MappingConfig(enabled=False),
+    keyframes=KeyframesConfig(use="always"), loops=LoopsConfig(enabled=False), mapping=MappingConfig(enabled=False)
 )
 
 

@@ -281,11 +281,7 @@ def street() -> SimulatedSequence:
 
 
 def drive_street(
-    street: SimulatedSequence,
-    progress: Progress = silent,
-    mode: str = "auto",
-    sky: float = 200.0,
-    stride: int = 2,
+    street: SimulatedSequence, progress: Progress = silent, mode: str = "auto", sky: float = 200.0, stride: int = 2
 ) -> Estimate:
     oracle = OraclePredictor(
         street.reference,

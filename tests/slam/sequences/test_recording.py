@@ -9,14 +9,7 @@ from slam.simulation.options import SimulationOptions
 
 @pytest.mark.parametrize(
     "text, wanted",
-    [
-        ("0:10", (0, 10)),
-        (":4", (0, 4)),
-        ("3:", (3, 10)),
-        (":", (0, 10)),
-        ("-4:-1", (6, 9)),
-        (" 2 : 5 ", (2, 5)),
-    ],
+    [("0:10", (0, 10)), (":4", (0, 4)), ("3:", (3, 10)), (":", (0, 10)), ("-4:-1", (6, 9)), (" 2 : 5 ", (2, 5))],
 )
 def test_ranges(text: str, wanted: tuple[int, int]) -> None:
     assert frame_range(text, 10) == wanted

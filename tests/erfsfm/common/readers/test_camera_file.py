@@ -46,10 +46,7 @@ def test_reads(tmp_path: Path, camera_yaml: str, line: str, height: float | None
         ("{yaml}readout_ms: 201\n", "readout_ms: at most 200, the time of a frame; is 201"),
         ("{yaml}model: omni\n", "model: Input should be 'pinhole', 'opencv', 'fisheye' or 'fov'"),
         ("{yaml}distortion: [0.1, 0, 0, 0]\n", "distortion: needs model opencv, fisheye or fov"),
-        (
-            "{yaml}model: opencv\ndistortion: [0.1]\n",
-            "model opencv has 4 or 5 or 8 or 12 or 14 numbers, not 1",
-        ),
+        ("{yaml}model: opencv\ndistortion: [0.1]\n", "model opencv has 4 or 5 or 8 or 12 or 14 numbers, not 1"),
         ("{yaml}model: fisheye\n", "model fisheye has 4 numbers, not 0"),
     ],
 )

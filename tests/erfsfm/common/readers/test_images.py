@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import (
-    has_images,
-    list_images,
-    read_image,
-    read_values,
-    resize_image,
-    stretch_of,
-)
+from erfsfm.common.readers.images import has_images, list_images, read_image, read_values, resize_image, stretch_of
 
 
 def test_reads_rgb_not_bgr(tmp_path: Path) -> None:

@@ -115,9 +115,7 @@ def packet(**columns: float) -> np.ndarray:
 
 def test_axes_by_hand() -> None:
     """Yaw 0 looks east and grows to the north; pitch puts the nose down, roll the left side up."""
-    packets = np.stack(
-        [packet(), packet(yaw=np.pi / 2), packet(pitch=0.1), packet(roll=0.1)],
-    )
+    packets = np.stack([packet(), packet(yaw=np.pi / 2), packet(pitch=0.1), packet(roll=0.1)])
     R = T_world_imu(packets, np.zeros(4))[:, :3, :3]
     assert R[0] == pytest.approx(np.eye(3))
     assert R[1] @ [1, 0, 0] == pytest.approx([0, 1, 0], abs=1e-12)  # forward is north

@@ -139,9 +139,7 @@ def test_shipped_weights_on_a_real_drive(data_root: Path, tmp_path: Path) -> Non
     assert 5 < rows["default"][1]["scale"] < 200
 
 
-DRIVE = "2011_09_26_drive_0099"
 PointsAt = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float32]]
-Write = Callable[..., Path]
 
 
 @pytest.mark.parametrize("fidelity", ["default", "paper"])

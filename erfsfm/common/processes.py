@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -50,6 +50,7 @@ def slam_process(
     threads: int = 0,
     memory_gib: float = 0.0,
     program: Sequence[str] = ("slam",),
+    variables: Mapping[str, str] | None = None,
 ) -> str:
     """Run ``erfsfm-slam ARGUMENTS`` with this interpreter, and wait for its end; why it failed, if it did.
 
@@ -60,13 +61,14 @@ def slam_process(
         threads: of libraries; 0 as they like.
         memory_gib: where it needs more, it is ended; 0 for no limit.
         program: module that is run, with words before the arguments.
+        variables: of its environment, beside those of this process.
     """
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
     with tempfile.TemporaryFile("w+b") if log is None else log.open("a+b") as said:
         process = subprocess.Popen(
             [sys.executable, "-Pm", *program, *arguments],
             cwd=folder,
-            env=os.environ | (limits if threads else {}),
+            env=os.environ | (limits if threads else {}) | dict(variables or {}),
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=said,

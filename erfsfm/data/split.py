@@ -94,7 +94,8 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     split = read_split_file(config.split) if config.split else Split()
-    scenes = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
+    left_out = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
+    scenes = [FrameRange.parse(name) for name in left_out]
     ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
     listed = [FrameRange.parse(name) for name in split.train]
     held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
@@ -113,8 +114,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     validation: list[Recording] = []
     for recording in found:
         validation += _parts(recording, held_out)
-        eigens = map(FrameRange.parse, scenes if recording.name.startswith("kitti_raw/") else ())
-        forbidden = [*held_out, *never, *eigens]
+        forbidden = [*held_out, *never, *(scenes if recording.name.startswith("kitti_raw/") else [])]
         chosen = next((each for each in (ranges, listed) if _spans(recording, each)), None)  # ranges before a list
         whole = [] if listed else [recording]
         for part in whole if chosen is None else _parts(recording, chosen):

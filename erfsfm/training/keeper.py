@@ -260,10 +260,13 @@ class OutputFolder:
         if not is_whole or {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
             raise TrainingError(f"{self.checkpoint} {wrong}")
         begun, wanted = read_yaml(self.config), config.model_dump(mode="json")  # begun with settings of another version
+        sections = [begun.get(name) for name in ("network", "training")] if isinstance(begun, dict) else [None]
+        if not all(isinstance(section, dict) for section in sections):
+            raise TrainingError(f"{self.config} is damaged: start again in another --output")
         if begun["network"] != wanted["network"]:
             raise ConfigError(f"the networks of {self.config} differ from this configuration: resume with the same one")
         for key in ("networks", "frozen_stages"):
-            before, now = begun["training"][key], wanted["training"][key]
+            before, now = begun["training"].get(key), wanted["training"][key]
             if before != now:
                 raise ConfigError(f"{self.config} began with training.{key} {before}; got {now}: resume with the same")
         return int(state["global_step"])

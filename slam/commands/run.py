@@ -35,7 +35,6 @@ from slam.prediction.depth_source import FrameNumbers
 from slam.results.estimate_metrics import DepthQuality, estimate_metrics, lidar_trajectory, map_errors, timing_of
 from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
-from slam.results.report.figures import map_view
 from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
 from slam.results.report.rerun import write_rerun
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
@@ -206,6 +205,8 @@ class FolderRecorder(Recorder):
 
         def reported() -> None:
             if self._settings.output.report:
+                from slam.results.report.figures import map_view  # with Plotly
+
                 pictures = self._depths.pictures(), self._loop_pictures(estimate)
                 write_report(self.folder, *pictures, map_view(self.folder), metrics)
 

@@ -172,12 +172,13 @@ class MergedSubmaps:
         def cells(of_blocks: Keys) -> NDArray[np.intp]:
             return np.asarray(np.ravel_multi_index(tuple((of_blocks - low).T), tuple(high - low)))
 
+        cells_of_all = cells(keys)
         for number, mask in enumerate(inside):
             if not mask.any():
                 continue
             submap = self.read(number)
             # where each block of the submap is among all of them: the numbers of their cells are sorted as their keys
-            rows = np.searchsorted(cells(keys), cells(self._keys[number][mask]))
+            rows = np.searchsorted(cells_of_all, cells(self._keys[number][mask]))
             observed, places = submap.blocks(mask)
             own = np.zeros(observed.shape, np.float32)
             own[observed] = submap.weight[places]

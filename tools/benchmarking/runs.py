@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -281,8 +280,8 @@ Time that the main thread spends in or waits for each stage, ms a frame:
 
 def _cost(checkout: Path, arguments: Sequence[str], output: Path) -> Cost:
     log = output.with_suffix(".log")
-    os.environ["PYTHONPATH"] = str(checkout)  # for the process
-    reason = slam_process(["run", *arguments, "--output", str(output)], checkout, log)
+    words, variables = ["run", *arguments, "--output", str(output)], {"PYTHONPATH": str(checkout)}
+    reason = slam_process(words, checkout, log, variables=variables)
     if reason:
         raise SystemExit(f"{' '.join(arguments)} by {checkout} failed: {reason}; see {log}")
     tree = json.loads((output / METRICS).read_text(encoding="utf-8"))

@@ -11,14 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
-from plotly.graph_objects import Figure
-from plotly.offline import get_plotlyjs
 
 from erfsfm.common.readers.images import resize_image
 from slam.formats.trajectory import Trajectory
@@ -28,12 +26,15 @@ from slam.mapping.depth import KeyframeDepth
 from slam.results import tables
 from slam.results.folder import RunFolder
 from slam.results.metrics import METRES, AcceptedLoop, LoopsFile, Metrics
-from slam.results.report import figures
-from slam.results.report.figures import MapView
 from slam.results.tables import alignments_table, errors_table, missing_errors, verdict
 from slam.runtime.errors import SlamError
 from slam.runtime.files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.record import NOT_RECORDED
+
+if TYPE_CHECKING:  # Plotly is for runs with a report, and for their end
+    from plotly.graph_objects import Figure
+
+    from slam.results.report.figures import MapView
 
 _ALIGNED = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
 _AS_WRITTEN = "As written; no ground truth is known. The raw network chain is scaled to the rest."
@@ -108,6 +109,8 @@ def _plots(
     metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: Sequence[AcceptedLoop], view: MapView | None
 ) -> dict[str, list[Picture]]:
     """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
+    from slam.results.report import figures
+
     found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": []}
 
     def add(section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> None:
@@ -150,6 +153,8 @@ def _plots(
 @cache
 def _plotly() -> str:
     """The library as base64 of gzip, which ``unpacked`` of page.js reads."""
+    from plotly.offline import get_plotlyjs
+
     return base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode("ascii")
 
 

@@ -418,6 +418,14 @@ def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
         train(config.model_copy(update={"network": network}), output, resume=True, device="cpu")
 
 
+@pytest.mark.parametrize("text", ["", "[1]", "network: {}", "network: {}\ntraining: 1"])
+def test_resume_with_a_damaged_configuration(cut: tuple[ExperimentConfig, Path], text: str) -> None:
+    config, output = cut
+    (output / "config.yaml").write_text(text)
+    with pytest.raises(TrainingError, match=r"config\.yaml is damaged"):
+        train(config, output, resume=True, device="cpu")
+
+
 class Malicious:
     """An object that runs a command when it is unpickled."""
 

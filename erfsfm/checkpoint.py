@@ -43,7 +43,7 @@ def build_networks(config: NetworkConfig) -> dict[NetworkKind, nn.Module]:
         if name in PRESETS and PRESETS[name].kind != kind:  # `build` refuses unknown names
             known = ", ".join(other for other, preset in PRESETS.items() if preset.kind == kind)
             raise ConfigError(f"network.{kind} must be a {kind} network ({known}); got '{name}'")
-    rest = config.sources, config.normalisation, config.activation, config.alignment
+    rest = config.sources, config.normalisation, config.activation
     widths = config.depth_width, config.pose_width
     return {kind: build(name, config.fidelity, width, *rest) for kind, name, width in zip(KINDS, presets, widths)}
 

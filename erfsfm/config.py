@@ -18,7 +18,6 @@ TrainedNetworks = Literal["both", "depth", "pose"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 EIGEN = "eigen"  # names the test scenes of Eigen et al., and the shipped split with their frames
 UNTRAINED = ("imagenet", "none")  # initial weights that no training of ours wrote
-_COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
 
 
 class NetworkConfig(Section):
@@ -39,16 +38,10 @@ class NetworkConfig(Section):
     )
     sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
     alignment: Literal["none", "images"] = Field(
-        default="none", description="images: outside training the pose network's rotations are measured in the images"
+        default="none", description="images: rotations and the direction of travel are measured in the images, from the pose network's guess"
     )
     height: int = Field(default=128, ge=32, le=4096, description="height of the network input, pixels")
     width: int = Field(default=416, ge=32, le=4096, description="width of the network input, pixels")
-
-    @model_validator(mode="after")
-    def _can_be_halved(self) -> Self:
-        if self.alignment == "images" and (self.height % _COARSEST or self.width % _COARSEST):
-            raise ValueError(f"network.alignment: images needs a height and width that are multiples of {_COARSEST}")
-        return self
 
 
 class DataConfig(Section):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from ctypes.util import find_library
 from functools import cache, lru_cache, partial
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -17,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.common.errors import CheckpointError, ConfigError, DataError
 from erfsfm.common.processes import usable_cores
-from erfsfm.common.readers.camera_file import MOST_PIXELS
+from erfsfm.common.readers.camera_file import MOST_PIXELS, Pinhole
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.common.readers.images import resize_image
@@ -26,6 +28,7 @@ from erfsfm.model_record import ModelRecord, find_weights, read_record, weights_
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.model_record import record_of_whole_weights as record_of_whole_weights
 from erfsfm.networks.onnx_graph import OnnxGraph
+from erfsfm.snippet_motion import Followed, followed, like_kitti, measured
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
     from torch import nn
@@ -115,6 +118,7 @@ class DepthPosePredictor:
         self.sha256 = sha256
         self.sources: int = record.network.sources
         self._networks = networks
+        self._steps: deque[tuple[Array, Array, Followed]] = deque(maxlen=self.sources)
 
     @classmethod
     def of(cls, model: Model, device: str = "cpu", sha256: str = "") -> DepthPosePredictor:
@@ -200,12 +204,16 @@ class DepthPosePredictor:
         """
         return np.asarray(self._output("depth", self.prepare(image))[0])
 
-    def poses(self, images: Sequence[NDArray[np.uint8] | Array]) -> NDArray[np.float64]:
+    def poses(
+        self, images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None = None
+    ) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
 
         Args:
             images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle, or what `prepare`
                 made of them.
+            camera: of the images, at any size; without it one like KITTI's. It counts where `NetworkConfig.alignment`
+                has the motion measured.
 
         Returns:
             ``T_source_target`` ``(N, 4, 4)``, target camera to source camera, unscaled; row k belongs to
@@ -221,12 +229,26 @@ class DepthPosePredictor:
             raise ValueError(f"images of a snippet must have one size; got {sorted(sizes)}")
         middle = self.sources // 2
         inputs = [self.prepare(image) for image in images]
-        target = inputs.pop(middle)
-        vectors = self._output("pose", target, inputs).astype(np.float64)
+        sources = inputs[:middle] + inputs[middle + 1 :]
+        vectors = self._output("pose", inputs[middle], sources).astype(np.float64)
         T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
         T_source_target[:, :3, :3] = Rotation.from_euler("XYZ", vectors[:, 3:]).as_matrix()
         T_source_target[:, :3, 3] = vectors[:, :3]
-        return T_source_target
+        network = self.record.network
+        if network.alignment == "none":
+            return T_source_target
+        camera = like_kitti(network.width, network.height) if camera is None else camera
+        steps = [self._followed(*pair) for pair in pairwise(inputs)]
+        return measured(T_source_target, steps, camera.resized(network.width, network.height))
+
+    def _followed(self, image: Array, after: Array) -> Followed:
+        """Corners of a prepared image in the next one; snippets that overlap share them."""
+        for first, second, known in self._steps:
+            if first is image and second is after:
+                return known
+        pair = [np.round((each[0, 1] + 1) * 127.5).astype(np.uint8) for each in (image, after)]  # green is sharpest
+        self._steps.append((image, after, followed(*pair)))
+        return self._steps[-1][2]
 
     def _output(self, kind: NetworkKind, *inputs: Array | list[Array]) -> Array:
         """Of a network for one input, refused where it is not finite: float16 weights may overflow in the pass."""

@@ -124,7 +124,7 @@ def read_tensors(folder: Path, kind: NetworkKind) -> dict[str, NDArray[Any]]:
 
 
 def weights_sha256(folder: Path) -> str:
-    """SHA-256 of both weight files together, and of the alignment of poses, which changes what they give."""
+    """SHA-256 of both weight files together, and of what poses are measured in, which changes them."""
     digest = hashlib.sha256()
     for path in (tensors_file(folder, kind) for kind in KINDS):
         digest.update(path.read_bytes() if path.is_file() else b"")

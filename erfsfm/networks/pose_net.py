@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 from erfsfm.networks.blocks import ConvBlock, Encoder, Fidelity, Layer, Normalisation, Variant, initialise, scaled
-from erfsfm.networks.image_alignment import Alignment, aligned
 
 POSE_SCALE = 0.01
 
@@ -35,11 +34,9 @@ class PoseNet(nn.Module):
         width: float = 1.0,
         sources: int = 4,
         normalisation: Normalisation = "none",
-        alignment: Alignment = "none",
     ) -> None:
         super().__init__()
         self.sources = sources
-        self.alignment = alignment
         channels = [scaled(count, width) for count in _ENCODER_CHANNELS]
         stages = []
         for stage, (kernel, inside, outside) in enumerate(zip(_KERNELS, [self.input_channels, *channels], channels)):
@@ -66,16 +63,14 @@ class PoseNet(nn.Module):
 
         Returns:
             ``T_source_target`` as translation (unscaled) and XYZ Euler angles (radians),
-            (tx, ty, tz, rx, ry, rz), ``(B, N, 6)``. With alignment to the images, rotations are measured there; in
-            training they are not.
+            (tx, ty, tz, rx, ry, rz), ``(B, N, 6)``.
 
         Raises:
             ValueError: if there are not N sources.
         """
         stages = self.encoder(_stacked(target, sources, self.sources))
         pooled: Tensor = self.pose_head(stages[-1]).mean(dim=(2, 3))  # (B, 6 * N)
-        guess = POSE_SCALE * pooled.view(-1, self.sources, 6)
-        return guess if self.training or self.alignment == "none" else aligned(guess, target, sources)
+        return POSE_SCALE * pooled.view(-1, self.sources, 6)
 
 
 def _stacked(target: Tensor, sources: Sequence[Tensor], count: int) -> Tensor:

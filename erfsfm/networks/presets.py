@@ -10,7 +10,6 @@ from erfsfm.common.errors import ConfigError
 from erfsfm.config import NetworkKind
 from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
-from erfsfm.networks.image_alignment import Alignment
 from erfsfm.networks.lite0 import Lite0DepthNet
 from erfsfm.networks.pose_net import PoseNet
 from erfsfm.networks.receptive_field import Network, multiply_adds, theoretical
@@ -46,7 +45,6 @@ def build(
     sources: int = 4,
     normalisation: Normalisation = "none",
     activation: Activation = "relu",
-    alignment: Alignment = "none",
 ) -> Network:
     """Build a network with fresh weights.
 
@@ -58,7 +56,6 @@ def build(
         normalisation: batch norm after every convolution but the heads, or none as published; a pretrained
             encoder has its own, and what follows it has none.
         activation: after every convolution but the heads, as published or leaking a tenth.
-        alignment: of a pose network's rotations to the images; a depth network ignores it.
 
     Raises:
         ConfigError: if the name or an option is unknown or out of range.
@@ -80,7 +77,7 @@ def build(
     elif preset.kind == "depth":
         network = DepthNet(preset.variant, fidelity, width, normalisation)
     else:
-        network = PoseNet(preset.variant, fidelity, width, sources, normalisation, alignment)
+        network = PoseNet(preset.variant, fidelity, width, sources, normalisation)
     if activation == "leaky":
         let_leak(network)
     return network

@@ -19,8 +19,8 @@ from slam.runtime.imports import import_plug_in, plug_ins
 class NetworkPredictor:
     """Depth and snippet poses of frames by the networks, for which each image is prepared once."""
 
-    def __init__(self, networks: DepthPosePredictor) -> None:
-        self._networks = networks
+    def __init__(self, networks: DepthPosePredictor, intrinsics: Intrinsics) -> None:
+        self._networks, self._intrinsics = networks, intrinsics
         self._key = object()  # key of outputs kept in frames, which outlive the networks
         self.sources = networks.sources
 
@@ -38,7 +38,7 @@ class NetworkPredictor:
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet; the target is the middle frame."""
-        T_source_target = self._networks.poses([self._prepared(frame) for frame in frames])
+        T_source_target = self._networks.poses([self._prepared(frame) for frame in frames], self._intrinsics)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
         return SnippetPoses(frames[middle].index, sources, T_source_target)
@@ -102,5 +102,5 @@ def open_prediction(
     """
     source = open_depth(depth, intrinsics, numbers, undistort)
     networks = DepthPosePredictor.from_weights(weights, device, "onnx")
-    own = NetworkPredictor(networks)
+    own = NetworkPredictor(networks, intrinsics)
     return Prediction(networks, source, own if source is None else SourcedPredictor(own, source, depth.align))

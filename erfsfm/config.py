@@ -38,7 +38,8 @@ class NetworkConfig(Section):
     )
     sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
     alignment: Literal["none", "images"] = Field(
-        default="none", description="images: rotations and the direction of travel are measured in the images, from the pose network's guess"
+        default="none",
+        description="images: rotations and the direction of travel that the pose network guesses are measured in them",
     )
     height: int = Field(default=128, ge=32, le=4096, description="height of the network input, pixels")
     width: int = Field(default=416, ge=32, le=4096, description="width of the network input, pixels")

@@ -204,9 +204,7 @@ class DepthPosePredictor:
         """
         return np.asarray(self._output("depth", self.prepare(image))[0])
 
-    def poses(
-        self, images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None = None
-    ) -> NDArray[np.float64]:
+    def poses(self, images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None = None) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
 
         Args:

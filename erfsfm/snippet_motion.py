@@ -77,12 +77,11 @@ def measured(T_source_target: Array, steps: Sequence[Followed], camera: Pinhole)
     T_image_target = np.insert(T_source_target, middle, np.eye(4), axis=0)
     T_next_image = T_image_target[1:] @ np.linalg.inv(T_image_target[:-1])
     R, t = T_next_image[:, :3, :3], T_next_image[:, :3, 3]
-    # a step in the camera halfway, whose axes are the means of those of the cameras before and after
-    travel = ((t + _turned(R.swapaxes(1, 2), t)) / 2).mean(axis=0)
+    travel = np.linalg.solve(_halfway(R), t[..., None])[..., 0].mean(axis=0)
     length = np.linalg.norm(travel)
     R, direction = _fitted(steps, camera, R, travel / length if length > 0 else np.array([0.0, 0.0, -1.0]))
     T_next_image = np.tile(np.eye(4), (count, 1, 1))
-    T_next_image[:, :3, :3], T_next_image[:, :3, 3] = R, length * _halfway(R, direction)
+    T_next_image[:, :3, :3], T_next_image[:, :3, 3] = R, length * _halfway(R) @ direction
     T = [np.eye(4)]
     for k in range(middle - 1, -1, -1):
         T.insert(0, np.linalg.inv(T_next_image[k]) @ T[0])
@@ -107,7 +106,8 @@ def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) 
     across, direction = np.eye(3) - np.outer(guess, guess), guess
     prior = across / _GUESS_SIGMA**2 + 1e8 * np.outer(guess, guess)  # the length is not measured
     for outlier in _OUTLIERS:
-        t, turned = _halfway(R, direction)[:, None], rays @ R.swapaxes(1, 2)
+        M = _halfway(R)
+        t, turned = (M @ direction)[:, None], rays @ R.swapaxes(1, 2)
         width = np.linalg.norm(np.cross(t, turned)[..., :2], axis=-1, keepdims=True)
         J = np.concatenate([np.cross(turned, np.cross(seen, t)), np.cross(turned, seen)], axis=-1)
         J /= np.maximum(width, 1e-12)
@@ -116,7 +116,6 @@ def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) 
         A, b = weighted.swapaxes(1, 2) @ J, -_turned(weighted.swapaxes(1, 2), error)
         A[:, :3, :3] += np.eye(3) / _LARGEST_TURN**2
         of_travel, turn = np.split(np.linalg.solve(A[:, :3, :3], np.dstack([A[:, :3, 3:], b[:, :3]])), [3], axis=-1)
-        M = (np.eye(3) + R) / 2
         left = A[:, 3:, 3:] - A[:, 3:, :3] @ of_travel
         right = b[:, 3:] - (A[:, 3:, :3] @ turn)[..., 0]
         normal = (M.swapaxes(1, 2) @ left @ M).sum(axis=0) + prior
@@ -126,9 +125,9 @@ def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) 
     return R, direction
 
 
-def _halfway(R: Array, direction: Array) -> Array:
-    """Translations ``(N, 3)`` of steps with rotations ``(N, 3, 3)`` in a direction of the camera halfway."""
-    return (direction + R @ direction) / 2
+def _halfway(R: Array) -> Array:
+    """A step's translation from that in the camera halfway, whose axes are the means of those of both cameras."""
+    return np.asarray((np.eye(3) + R) / 2)
 
 
 def _turned(R: Array, vectors: Array) -> Array:

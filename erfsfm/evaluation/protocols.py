@@ -161,7 +161,9 @@ def pose_protocol(
             if T_world_camera is None:
                 raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
             snippets.append(snippets_from_trajectory(T_world_camera, length))
-            predicted += [snippet_from_network(networks.poses(images, part.camera)) for images in _windows(part, length)]
+            predicted += [
+                snippet_from_network(networks.poses(images, part.camera)) for images in _windows(part, length)
+            ]
         if not predicted:
             longest = max(map(len, parts))
             raise DataError(f"{shown} has {longest} frames without a gap; a snippet needs {length}")

@@ -26,7 +26,7 @@ def frames(first: int, count: int = 5) -> list[Frame]:
 
 
 def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePredictor) -> None:
-    predictor: Predictor = NetworkPredictor(direct)
+    predictor: Predictor = NetworkPredictor(direct, CAMERA)
     snippet = frames(10)
     depth = predictor.depth(snippet[0])
     assert depth.shape == (48, 160) and depth.dtype == np.float32 and (depth > 0).all()
@@ -52,7 +52,7 @@ def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredic
             asked.append(image)
             return direct.disparity(image)
 
-    predictor, snippet = NetworkPredictor(Counted()), frames(0)
+    predictor, snippet = NetworkPredictor(Counted(), CAMERA), frames(0)
     for frame in snippet:
         predictor.depth(frame)
     predictor.snippet(snippet)

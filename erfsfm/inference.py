@@ -221,23 +221,31 @@ class DepthPosePredictor:
             ValueError: another number of images than the networks were trained for, or several sizes.
             CheckpointError: there is no pose network, or its output is not finite.
         """
-        if len(images) != self.sources + 1:
-            raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
-        if len(sizes := {image.shape for image in images if image.ndim == 3}) > 1:
-            raise ValueError(f"images of a snippet must have one size; got {sorted(sizes)}")
-        middle = self.sources // 2
-        inputs = [self.prepare(image) for image in images]
+        inputs, network = self._inputs(images), self.record.network
+        guess = self.guessed_poses(inputs)
+        if network.alignment == "none":
+            return guess
+        camera = like_kitti(network.width, network.height) if camera is None else camera
+        steps = [self._followed(*pair) for pair in pairwise(inputs)]
+        return measured(guess, steps, camera.resized(network.width, network.height))
+
+    def guessed_poses(self, images: Sequence[NDArray[np.uint8] | Array]) -> NDArray[np.float64]:
+        """As `poses`, by the pose network alone."""
+        inputs, middle = self._inputs(images), self.sources // 2
         sources = inputs[:middle] + inputs[middle + 1 :]
         vectors = self._output("pose", inputs[middle], sources).astype(np.float64)
         T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
         T_source_target[:, :3, :3] = Rotation.from_euler("XYZ", vectors[:, 3:]).as_matrix()
         T_source_target[:, :3, 3] = vectors[:, :3]
-        network = self.record.network
-        if network.alignment == "none":
-            return T_source_target
-        camera = like_kitti(network.width, network.height) if camera is None else camera
-        steps = [self._followed(*pair) for pair in pairwise(inputs)]
-        return measured(T_source_target, steps, camera.resized(network.width, network.height))
+        return T_source_target
+
+    def _inputs(self, images: Sequence[NDArray[np.uint8] | Array]) -> list[Array]:
+        """The images of a snippet as the networks take them."""
+        if len(images) != self.sources + 1:
+            raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
+        if len(sizes := {image.shape for image in images if image.ndim == 3}) > 1:
+            raise ValueError(f"images of a snippet must have one size; got {sorted(sizes)}")
+        return [self.prepare(image) for image in images]
 
     def _followed(self, image: Array, after: Array) -> Followed:
         """Corners of a prepared image in the next one; snippets that overlap share them."""

@@ -24,12 +24,13 @@ Array = NDArray[np.float64]
 _CELL = 16  # pixels a side; of each cell the best corner is followed
 _WINDOW = 11  # pixels
 _HALVINGS = 3
+_SEARCH = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03  # iterations, and pixels of the last one
 _LEAST_TEXTURE = 1e-4  # smaller eigenvalue of the structure tensor, by OpenCV's measure
 _SAME = 0.5  # pixels from a corner to where it is followed back to
 _PIXEL_SIGMA = 0.25
 _GUESS_SIGMA = np.radians(0.6)  # of the guessed direction of travel
 _LARGEST_TURN = np.radians(3.0)  # sigma of a rotation in one step of the least squares
-_OUTLIERS = (8.0, 4.0, 2.0, 1.0, 1.0)  # sigmas at which a corner counts half, for each step (Cauchy's weights)
+_OUTLIERS = (8.0, 3.0, 1.0, 1.0)  # sigmas at which a corner counts half, for each step (Cauchy's weights)
 _KITTI = (0.58, 1.92, 0.495, 0.48)  # focal lengths and principal point in widths and heights of the image
 
 
@@ -55,7 +56,7 @@ def followed(image: NDArray[np.uint8], after: NDArray[np.uint8]) -> Followed:
     best = cells.argmax(axis=1)
     row, column = np.divmod(np.arange(rows * columns), columns)
     corners = np.stack([column * _CELL + best % _CELL, row * _CELL + best // _CELL], axis=1).astype(np.float32)
-    options = {"winSize": (_WINDOW, _WINDOW), "maxLevel": _HALVINGS}
+    options = {"winSize": (_WINDOW, _WINDOW), "maxLevel": _HALVINGS, "criteria": _SEARCH}
     found, there, _ = cv2.calcOpticalFlowPyrLK(image, after, corners[:, None], None, **options)  # type: ignore[call-overload]
     returned, back, _ = cv2.calcOpticalFlowPyrLK(after, image, found, None, **options)  # type: ignore[call-overload]
     known = (there[:, 0] > 0) & (back[:, 0] > 0) & (np.abs(returned[:, 0] - corners).max(axis=1) < _SAME)

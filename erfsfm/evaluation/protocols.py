@@ -7,7 +7,7 @@ On other drives static surfaces are measured from neighbouring frames at a run's
 from __future__ import annotations
 
 import tempfile
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -136,8 +136,8 @@ def _picture(image: NDArray[np.uint8], depths: Iterable[NDArray[np.float32]], tr
 def pose_protocol(
     networks: DepthPosePredictor, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
-    """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and
-    constant velocity straight ahead.
+    """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, the pose network alone
+    where its guess is the start of a measurement, and constant velocity straight ahead.
 
     No snippet spans a gap, and a stretch between gaps that is shorter than one is passed over. In paper fidelity the
     truth is that of camera 0, whichever camera took the images.
@@ -155,23 +155,24 @@ def pose_protocol(
         leak = refuse_leak(networks, [part.frames_name for part in parts], allow_leak)
         if length != 5:
             raise DataError(f"the snippet protocol needs networks with 4 sources; these have {networks.sources}")
-        snippets, predicted = [], []
+        snippets, predicted = [], defaultdict(list)
         for part in parts:
             T_world_camera = part.true_poses(fidelity)
             if T_world_camera is None:
                 raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
             snippets.append(snippets_from_trajectory(T_world_camera, length))
-            predicted += [
-                snippet_from_network(networks.poses(images, part.camera)) for images in _windows(part, length)
-            ]
+            for images in _windows(part, networks):
+                predicted["networks"].append(snippet_from_network(networks.poses(images, part.camera)))
+                if networks.record.network.alignment != "none":
+                    predicted["pose network alone"].append(snippet_from_network(networks.guessed_poses(images)))
         if not predicted:
             longest = max(map(len, parts))
             raise DataError(f"{shown} has {longest} frames without a gap; a snippet needs {length}")
         true = np.concatenate(snippets)
         straight = np.tile(np.eye(4), (len(true), length, 1, 1))
         straight[:, :, 2, 3] = np.arange(length)
-        for method, guess in (("networks", np.stack(predicted)), ("straight constant motion", straight)):
-            errors = asdict(snippet_errors(guess, true, fidelity=fidelity))
+        for method, guess in (predicted | {"straight constant motion": straight}).items():
+            errors = asdict(snippet_errors(np.stack(list(guess)), true, fidelity=fidelity))
             count = errors.pop("count")
             rows.append({"method": method, "recording": shown, **errors, "snippets": count, "leak": leak})
     return rows
@@ -200,12 +201,12 @@ def named_recordings(root: Path, name: str) -> list[Recording]:
     return chosen
 
 
-def _windows(recording: Recording, length: int) -> Iterator[list[NDArray[np.uint8]]]:
-    """The images of each window of frames; no more of them are held than one window has."""
-    images: deque[NDArray[np.uint8]] = deque(maxlen=length)
+def _windows(recording: Recording, networks: DepthPosePredictor) -> Iterator[list[NDArray[np.float32]]]:
+    """The prepared images of each snippet; no more of them are held than one has."""
+    images: deque[NDArray[np.float32]] = deque(maxlen=networks.sources + 1)
     for index in range(len(recording)):
-        images.append(recording.image(index, recording.camera.height, recording.camera.width))
-        if len(images) == length:
+        images.append(networks.prepare(recording.image(index, recording.camera.height, recording.camera.width)))
+        if len(images) == images.maxlen:
             yield list(images)
 
 

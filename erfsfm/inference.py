@@ -210,8 +210,7 @@ class DepthPosePredictor:
         Args:
             images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle, or what `prepare`
                 made of them.
-            camera: of the images, at any size; without it one like KITTI's. It counts where `NetworkConfig.alignment`
-                has the motion measured.
+            camera: of the images, at any size, where the motion is measured; without it one like KITTI's.
 
         Returns:
             ``T_source_target`` ``(N, 4, 4)``, target camera to source camera, unscaled; row k belongs to
@@ -223,11 +222,16 @@ class DepthPosePredictor:
         """
         inputs, network = self._inputs(images), self.record.network
         guess = self.guessed_poses(inputs)
-        if network.alignment == "none":
+        if not self.measures:
             return guess
         camera = like_kitti(network.width, network.height) if camera is None else camera
         steps = [self._followed(*pair) for pair in pairwise(inputs)]
         return measured(guess, steps, camera.resized(network.width, network.height))
+
+    @property
+    def measures(self) -> bool:
+        """Whether the pose network's guess is the start of a measurement in the images."""
+        return self.record.network.alignment == "images"
 
     def guessed_poses(self, images: Sequence[NDArray[np.uint8] | Array]) -> NDArray[np.float64]:
         """As `poses`, by the pose network alone."""

@@ -11,7 +11,7 @@ Within a snippet a camera moves steadily: its path is made of equal steps in one
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -56,9 +56,10 @@ def followed(image: NDArray[np.uint8], after: NDArray[np.uint8]) -> Followed:
     best = cells.argmax(axis=1)
     row, column = np.divmod(np.arange(rows * columns), columns)
     corners = np.stack([column * _CELL + best % _CELL, row * _CELL + best // _CELL], axis=1).astype(np.float32)
-    options = {"winSize": (_WINDOW, _WINDOW), "maxLevel": _HALVINGS, "criteria": _SEARCH}
-    found, there, _ = cv2.calcOpticalFlowPyrLK(image, after, corners[:, None], None, **options)  # type: ignore[call-overload]
-    returned, back, _ = cv2.calcOpticalFlowPyrLK(after, image, found, None, **options)  # type: ignore[call-overload]
+    search: dict[str, Any] = {"winSize": (_WINDOW, _WINDOW), "criteria": _SEARCH}
+    found, there, _ = cv2.calcOpticalFlowPyrLK(image, after, corners[:, None], None, maxLevel=_HALVINGS, **search)  # type: ignore[call-overload]
+    search |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}  # back from where it was takes no pyramid
+    returned, back, _ = cv2.calcOpticalFlowPyrLK(after, image, found, corners[:, None].copy(), **search)
     known = (there[:, 0] > 0) & (back[:, 0] > 0) & (np.abs(returned[:, 0] - corners).max(axis=1) < _SAME)
     return Followed(corners.astype(float), found[:, 0].astype(float), known & (cells.max(axis=1) > _LEAST_TEXTURE))
 
@@ -100,27 +101,29 @@ def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) 
     """
     f, c = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     rays, seen = (
-        np.pad((np.stack(pixels) - c) / f, ((0, 0), (0, 0), (0, 1)), constant_values=1.0)
+        np.pad((np.stack(pixels) - c) / f, ((0, 0), (0, 0), (0, 1)), constant_values=1.0).swapaxes(1, 2).copy()
         for pixels in ([step.before for step in steps], [step.after for step in steps])
     )
-    information = np.stack([step.known for step in steps]) * (f.mean() / _PIXEL_SIGMA) ** 2
+    information = np.stack([step.known for step in steps])[:, None] * (f.mean() / _PIXEL_SIGMA) ** 2
     across, direction = np.eye(3) - np.outer(guess, guess), guess
     prior = across / _GUESS_SIGMA**2 + 1e8 * np.outer(guess, guess)  # the length is not measured
     for outlier in _OUTLIERS:
         M = _halfway(R)
-        t, turned = (M @ direction)[:, None], rays @ R.swapaxes(1, 2)
-        width = np.linalg.norm(np.cross(t, turned)[..., :2], axis=-1, keepdims=True)
-        J = np.concatenate([np.cross(turned, np.cross(seen, t)), np.cross(turned, seen)], axis=-1)
-        J /= np.maximum(width, 1e-12)
-        error = (J[..., 3:] * t).sum(axis=-1)
-        weighted = J * (information / (1 + information * (error / outlier) ** 2))[..., None]
-        A, b = weighted.swapaxes(1, 2) @ J, -_turned(weighted.swapaxes(1, 2), error)
+        t, turned = (M @ direction)[..., None], R @ rays
+        slope = t[:, [1, 2]] * turned[:, [2, 0]] - t[:, [2, 0]] * turned[:, [1, 2]]  # of the epipolar line
+        width = np.maximum(np.sqrt((slope * slope).sum(axis=1, keepdims=True)), 1e-12)
+        normal = turned[:, [1, 2, 0]] * seen[:, [2, 0, 1]] - turned[:, [2, 0, 1]] * seen[:, [1, 2, 0]]
+        by_turn = seen * (turned * t).sum(axis=1, keepdims=True) - t * (turned * seen).sum(axis=1, keepdims=True)
+        J = np.concatenate([by_turn, normal], axis=1) / width  # (N, 6, P)
+        error = (J[:, 3:] * t).sum(axis=1, keepdims=True)
+        weighted = J * (information / (1 + information * (error / outlier) ** 2))
+        A, b = weighted @ J.swapaxes(1, 2), -(weighted * error).sum(axis=2)
         A[:, :3, :3] += np.eye(3) / _LARGEST_TURN**2
         of_travel, turn = np.split(np.linalg.solve(A[:, :3, :3], np.dstack([A[:, :3, 3:], b[:, :3]])), [3], axis=-1)
         left = A[:, 3:, 3:] - A[:, 3:, :3] @ of_travel
         right = b[:, 3:] - (A[:, 3:, :3] @ turn)[..., 0]
-        normal = (M.swapaxes(1, 2) @ left @ M).sum(axis=0) + prior
-        shift = np.linalg.solve(normal, _turned(M.swapaxes(1, 2), right).sum(axis=0) + prior @ (guess - direction))
+        system = (M.swapaxes(1, 2) @ left @ M).sum(axis=0) + prior
+        shift = np.linalg.solve(system, _turned(M.swapaxes(1, 2), right).sum(axis=0) + prior @ (guess - direction))
         R = Rotation.from_rotvec(turn[..., 0] - _turned(of_travel, M @ shift)).as_matrix() @ R
         direction = (direction + shift) / np.linalg.norm(direction + shift)
     return R, direction

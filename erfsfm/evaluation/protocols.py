@@ -163,7 +163,7 @@ def pose_protocol(
             snippets.append(snippets_from_trajectory(T_world_camera, length))
             for images in _windows(part, networks):
                 predicted["networks"].append(snippet_from_network(networks.poses(images, part.camera)))
-                if networks.record.network.alignment != "none":
+                if networks.measures:
                     predicted["pose network alone"].append(snippet_from_network(networks.guessed_poses(images)))
         if not predicted:
             longest = max(map(len, parts))

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import Pinhole
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
@@ -33,16 +34,22 @@ from slam.simulation.street import SimulatedStreet
 class Oracle:
     """Right up to scale about the drive of ``write_root``, which it recognises by nothing but the calls."""
 
+    measures = False
+
     def __init__(self, step: tuple[float, float, float], sources: int = 4, seen: Sequence[str] = ()) -> None:
         self.step = np.array(step)
         self.sources = sources
         self.seen = seen
 
+    @staticmethod
+    def prepare(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return image
+
     def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         return np.full(image.shape[:2], 3.0, np.float32)
 
-    def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
-        assert len(images) == self.sources + 1
+    def poses(self, images: Sequence[NDArray[np.uint8]], camera: Pinhole) -> NDArray[np.float64]:
+        assert (camera.height, camera.width) == images[0].shape[:2] and len(images) == self.sources + 1
         T_source_target = np.tile(np.eye(4), (self.sources, 1, 1))
         offsets = [k for k in range(-self.sources // 2, self.sources // 2 + 1) if k]
         T_source_target[:, :3, 3] = [-k * self.step / 3 for k in offsets]  # another scale
@@ -84,6 +91,18 @@ def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> Non
     assert networks["ate_mean"] == pytest.approx(0, abs=1e-9)
     assert straight["ate_mean"] > 0.01, "the drive slides sideways"
     assert networks["leak"] is False
+
+
+def test_the_pose_network_alone_stands_beside_what_is_measured(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=9, step=STEP)
+
+    class Measuring(Oracle):
+        measures = True
+        guessed_poses = staticmethod(lambda images: np.tile(np.eye(4), (4, 1, 1)))
+
+    rows = pose_protocol(Measuring(STEP), tmp_path, ["00"], "default", allow_leak=False)
+    assert [row["method"] for row in rows] == ["networks", "pose network alone", "straight constant motion"]
+    assert rows[0]["ate_mean"] == pytest.approx(0, abs=1e-9) and rows[1]["ate_mean"] > 0.01
 
 
 def test_frames_of_a_sequence_are_checked_for_leaks(tmp_path: Path, write_root: Callable[..., Path]) -> None:

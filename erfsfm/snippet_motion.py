@@ -61,7 +61,8 @@ def followed(image: NDArray[np.uint8], after: NDArray[np.uint8]) -> Followed:
     search |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}  # back from where it was takes no pyramid
     returned, back, _ = cv2.calcOpticalFlowPyrLK(after, image, found, corners[:, None].copy(), **search)
     known = (there[:, 0] > 0) & (back[:, 0] > 0) & (np.abs(returned[:, 0] - corners).max(axis=1) < _SAME)
-    return Followed(corners.astype(float), found[:, 0].astype(float), known & (cells.max(axis=1) > _LEAST_TEXTURE))
+    known &= cells.max(axis=1) > _LEAST_TEXTURE
+    return Followed(corners.astype(float), np.where(known[:, None], found[:, 0], corners).astype(float), known)
 
 
 def measured(T_source_target: Array, steps: Sequence[Followed], camera: Pinhole) -> Array:

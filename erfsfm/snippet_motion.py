@@ -97,22 +97,22 @@ def measured(T_source_target: Array, steps: Sequence[Followed], camera: Pinhole)
 def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) -> tuple[Array, Array]:
     """Rotations ``(N, 3, 3)`` from each image to the next, and the direction of travel ``(3,)``, by Gauss and Newton.
 
-    The residual of a corner is its distance from the epipolar line in the next image, ``t x R x`` for a ray ``x``.
-    Rotations are eliminated, each of which is in one step alone, so that three unknowns are left.
+    The residual of a corner is its distance in pixels from the epipolar line ``t x R x`` of its ray ``x``, in the next
+    image. Rotations are eliminated, each of which is in one step alone, so that three unknowns are left.
     """
     f, c = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     rays, seen = (
         np.pad((np.stack(pixels) - c) / f, ((0, 0), (0, 0), (0, 1)), constant_values=1.0).swapaxes(1, 2).copy()
         for pixels in ([step.before for step in steps], [step.after for step in steps])
     )
-    information = np.stack([step.known for step in steps])[:, None] * (f.mean() / _PIXEL_SIGMA) ** 2
+    information = np.stack([step.known for step in steps])[:, None] / _PIXEL_SIGMA**2
     across, direction = np.eye(3) - np.outer(guess, guess), guess
     prior = across / _GUESS_SIGMA**2 + 1e8 * np.outer(guess, guess)  # the length is not measured
     for outlier in _OUTLIERS:
         M = _halfway(R)
         t, turned = (M @ direction)[..., None], R @ rays
         slope = t[:, [1, 2]] * turned[:, [2, 0]] - t[:, [2, 0]] * turned[:, [1, 2]]  # of the epipolar line
-        width = np.maximum(np.sqrt((slope * slope).sum(axis=1, keepdims=True)), 1e-12)
+        width = np.maximum(np.sqrt(((slope / f[:, None]) ** 2).sum(axis=1, keepdims=True)), 1e-12)
         normal = turned[:, [1, 2, 0]] * seen[:, [2, 0, 1]] - turned[:, [2, 0, 1]] * seen[:, [1, 2, 0]]
         by_turn = seen * (turned * t).sum(axis=1, keepdims=True) - t * (turned * seen).sum(axis=1, keepdims=True)
         J = np.concatenate([by_turn, normal], axis=1) / width  # (N, 6, P)

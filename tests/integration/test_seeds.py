@@ -12,7 +12,7 @@ from slam.results.folder import RunFolder
 
 QUICK = ("mapping.enabled=false", "output.report=false")
 BYTES = ("trajectory_odometry.kitti.txt", "trajectory_optimised.kitti.txt", "graph.g2o")
-ATE_M = 0.034  # measured; each run may have twice that
+ATE_M = 0.052  # measured; each run may have twice that
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from erfsfm.model_record import ModelRecord, find_weights, read_record, weights_
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.model_record import record_of_whole_weights as record_of_whole_weights
 from erfsfm.networks.onnx_graph import OnnxGraph
-from erfsfm.snippet_motion import Followed, followed, like_kitti, measured
+from erfsfm.snippet_motion import LIKE_KITTI, Followed, followed, measured
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
     from torch import nn
@@ -220,18 +220,23 @@ class DepthPosePredictor:
             ValueError: another number of images than the networks were trained for, or several sizes.
             CheckpointError: there is no pose network, or its output is not finite.
         """
-        inputs, network = self._inputs(images), self.record.network
-        guess = self.guessed_poses(inputs)
-        if not self.measures:
-            return guess
-        camera = like_kitti(network.width, network.height) if camera is None else camera
-        steps = [self._followed(*pair) for pair in pairwise(inputs)]
-        return measured(guess, steps, camera.resized(network.width, network.height))
+        inputs = self._inputs(images)
+        return self.measured_poses(self.guessed_poses(inputs), inputs, camera)
 
     @property
     def measures(self) -> bool:
         """Whether the pose network's guess is the start of a measurement in the images."""
         return self.record.network.alignment == "images"
+
+    def measured_poses(
+        self, guess: NDArray[np.float64], images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None
+    ) -> NDArray[np.float64]:
+        """As `poses`, from their `guessed_poses`, which stay where nothing is measured."""
+        if not self.measures:
+            return guess
+        network = self.record.network
+        steps = [self._followed(*pair) for pair in pairwise(self._inputs(images))]
+        return measured(guess, steps, (camera or LIKE_KITTI).resized(network.width, network.height))
 
     def guessed_poses(self, images: Sequence[NDArray[np.uint8] | Array]) -> NDArray[np.float64]:
         """As `poses`, by the pose network alone."""
@@ -253,12 +258,12 @@ class DepthPosePredictor:
 
     def _followed(self, image: Array, after: Array) -> Followed:
         """Corners of a prepared image in the next one; snippets that overlap share them."""
-        for first, second, known in self._steps:
+        for first, second, step in self._steps:
             if first is image and second is after:
-                return known
-        pair = [np.round((each[0, 1] + 1) * 127.5).astype(np.uint8) for each in (image, after)]  # green is sharpest
-        self._steps.append((image, after, followed(*pair)))
-        return self._steps[-1][2]
+                return step
+        step = followed(*(np.round((each[0, 1] + 1) * 127.5).astype(np.uint8) for each in (image, after)))  # of green
+        self._steps.append((image, after, step))
+        return step
 
     def _output(self, kind: NetworkKind, *inputs: Array | list[Array]) -> Array:
         """Of a network for one input, refused where it is not finite: float16 weights may overflow in the pass."""

@@ -31,7 +31,7 @@ _PIXEL_SIGMA = 0.25
 _GUESS_SIGMA = np.radians(0.6)  # of the guessed direction of travel
 _LARGEST_TURN = np.radians(3.0)  # sigma of a rotation in one step of the least squares
 _OUTLIERS = (8.0, 3.0, 1.0, 1.0)  # sigmas at which a corner counts half, for each step (Cauchy's weights)
-_KITTI = (0.58, 1.92, 0.495, 0.48)  # focal lengths and principal point in widths and heights of the image
+LIKE_KITTI = Pinhole(1, 1, 0.58, 1.92, 0.495 - 0.5, 0.48 - 0.5)  # of images whose camera nobody tells, once resized
 
 
 class Followed(NamedTuple):
@@ -40,12 +40,6 @@ class Followed(NamedTuple):
     before: Array
     after: Array
     known: NDArray[np.bool_]
-
-
-def like_kitti(width: int, height: int) -> Pinhole:
-    """The camera of images whose camera nobody tells."""
-    fx, fy, cx, cy = _KITTI
-    return Pinhole(width, height, fx * width, fy * height, cx * width - 0.5, cy * height - 0.5)
 
 
 def followed(image: NDArray[np.uint8], after: NDArray[np.uint8]) -> Followed:
@@ -106,8 +100,8 @@ def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) 
         for pixels in ([step.before for step in steps], [step.after for step in steps])
     )
     information = np.stack([step.known for step in steps])[:, None] / _PIXEL_SIGMA**2
-    across, direction = np.eye(3) - np.outer(guess, guess), guess
-    prior = across / _GUESS_SIGMA**2 + 1e8 * np.outer(guess, guess)  # the length is not measured
+    along, direction = np.outer(guess, guess), guess
+    prior = (np.eye(3) - along) / _GUESS_SIGMA**2 + 1e8 * along  # the length is not measured
     for outlier in _OUTLIERS:
         M = _halfway(R)
         t, turned = (M @ direction)[..., None], R @ rays

@@ -162,17 +162,20 @@ def pose_protocol(
                 raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
             snippets.append(snippets_from_trajectory(T_world_camera, length))
             for images in _windows(part, networks):
-                predicted["networks"].append(snippet_from_network(networks.poses(images, part.camera)))
+                guess = networks.guessed_poses(images)
+                poses = networks.measured_poses(guess, images, part.camera)
+                predicted["networks"].append(snippet_from_network(poses))
                 if networks.measures:
-                    predicted["pose network alone"].append(snippet_from_network(networks.guessed_poses(images)))
+                    predicted["pose network alone"].append(snippet_from_network(guess))
         if not predicted:
             longest = max(map(len, parts))
             raise DataError(f"{shown} has {longest} frames without a gap; a snippet needs {length}")
         true = np.concatenate(snippets)
         straight = np.tile(np.eye(4), (len(true), length, 1, 1))
         straight[:, :, 2, 3] = np.arange(length)
-        for method, guess in (predicted | {"straight constant motion": straight}).items():
-            errors = asdict(snippet_errors(np.stack(list(guess)), true, fidelity=fidelity))
+        predicted["straight constant motion"] = list(straight)
+        for method, snippet_poses in predicted.items():
+            errors = asdict(snippet_errors(np.stack(snippet_poses), true, fidelity=fidelity))
             count = errors.pop("count")
             rows.append({"method": method, "recording": shown, **errors, "snippets": count, "leak": leak})
     return rows

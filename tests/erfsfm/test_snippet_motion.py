@@ -16,7 +16,7 @@ from erfsfm.common.readers.camera_file import Pinhole
 from erfsfm.config import NetworkConfig
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import ModelRecord
-from erfsfm.snippet_motion import Followed, followed, like_kitti, measured
+from erfsfm.snippet_motion import LIKE_KITTI, Followed, followed, measured
 
 Array = NDArray[np.float64]
 KITTI = Pinhole(416, 128, 241.0, 245.0, 203.2, 62.7)
@@ -146,4 +146,4 @@ def test_a_predictor_measures_with_the_camera_of_the_images() -> None:
     assert errors_deg(networks.poses([networks.prepare(each) for each in images], larger), wanted)[0] < 0.1
     as_kitti = networks.poses(images)
     assert errors_deg(as_kitti, wanted)[0] > 1
-    np.testing.assert_allclose(as_kitti, networks.poses(images, like_kitti(1241, 376)), atol=1e-9)
+    np.testing.assert_allclose(as_kitti, networks.poses(images, LIKE_KITTI.resized(1241, 376)), atol=1e-9)

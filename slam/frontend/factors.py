@@ -207,7 +207,7 @@ def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibra
 
 
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
-    """The raw network trajectory: target to next source of each snippet, without a graph.
+    """The network trajectory: target to next source of each snippet, without a graph.
 
     Frames before the first target and after the last come from the direct poses of these two snippets. There is one a
     target, in time order without gaps.

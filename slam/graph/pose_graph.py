@@ -32,8 +32,8 @@ from slam.runtime.files import write_atomically
 _ANCHOR_SIGMA = 1e-6
 _LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
 HUBER_K = 1.345  # whitened residual at which the loss becomes linear: 95 % efficient for normal errors
-# of a loop that is removed: whitened residual, and over the median of all loops
-_LARGEST_LOOP_RESIDUAL, _OUTLYING = 8.0, 3.0
+# of a loop or position that is removed: whitened residual, and over the median of its kind
+_LARGEST_RESIDUAL, _OUTLYING = 8.0, 3.0
 _MAX_ITERATIONS = 100  # of Levenberg-Marquardt
 _MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
 _RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
@@ -123,26 +123,27 @@ class PoseGraph:
                 _check_connected(self.relative_poses, len(T_world_camera_initial))
         raise SlamError(f"the pose graph cannot be solved even without {len(self.dropped)} loop edges")
 
-    def drop_contradicted_loops(self) -> tuple[RelativePose, ...]:
-        """Drop the loops with a large residual at the optimised trajectory while most others have a small one.
+    def drop_contradicted(self) -> bool:
+        """Drop loops and positions with a large residual at the optimised trajectory while most have a small one.
 
-        Where the odometry is overconfident all loops have large residuals. So a loop must also lie far above the
-        median residual of all loops.
+        Where the odometry is overconfident all have large residuals. So one must also lie far above the median of its
+        kind.
 
         Returns:
-            The loops dropped; where there are any, optimise again.
+            Whether one was dropped: optimise again.
         """
-        squared = self.errors
-        is_loop = np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
-        if not is_loop.any():
-            return ()
-        typical = float(np.median(np.sqrt(squared[is_loop])))
-        limit = max(_LARGEST_LOOP_RESIDUAL, _OUTLYING * typical)
-        beyond = is_loop & (squared > limit**2)
-        gone = tuple(edge for edge, out in zip(self.relative_poses, beyond, strict=True) if out)
-        self.relative_poses = [edge for edge, out in zip(self.relative_poses, beyond, strict=True) if not out]
+        loops = [edge for edge in self.relative_poses if edge.source == LOOP_SOURCE]
+        wrong_loops = _outlying(whitened_squared(loops, self._solution()))
+        gone = [edge for edge, is_wrong in zip(loops, wrong_loops, strict=True) if is_wrong]
+        self.relative_poses = [edge for edge in self.relative_poses if not any(edge is each for each in gone)]
         self.dropped += gone
-        return gone
+        placed = (self.T_fixed_world @ self._solution())[:, :3, 3]
+        squared = [float((((placed[k] - where) / sigmas) ** 2).sum()) for k, where, sigmas in self._positions]
+        wrong = _outlying(np.array(squared))
+        self._positions = [each for each, is_wrong in zip(self._positions, wrong, strict=True) if not is_wrong]
+        if wrong.any():
+            logger.warning("%d of %d positions contradict the others: left out", wrong.sum(), len(wrong))
+        return bool(gone) or bool(wrong.any())
 
     def marginal(self, frame: int) -> FloatArray:
         """Covariance ``(6, 6)`` of a frame's pose at the optimised trajectory, with the first frame fixed.
@@ -221,6 +222,12 @@ def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: Flo
         residual = gtsam.Pose3.Logmap(_pose3(edge.T_from_to).between(_pose3(T_from_to)))
         squared.append(float(((residual / edge.sigmas) ** 2).sum()))
     return np.array(squared)
+
+
+def _outlying(squared: FloatArray) -> NDArray[np.bool_]:
+    """Which whitened squared residuals ``(F,)`` are large by themselves, and far above the median."""
+    typical = float(np.sqrt(np.median(squared))) if len(squared) else 0.0
+    return np.asarray(squared > max(_LARGEST_RESIDUAL, _OUTLYING * typical) ** 2)
 
 
 def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None:

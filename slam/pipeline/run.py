@@ -272,7 +272,7 @@ class SlamPipeline:
             graph.add_positions(*positions, location.T_enu_world)
         with self._watch.stage("graph"):
             T_optimised = graph.optimise(T_odometry)
-            while graph.drop_contradicted_loops():
+            while graph.drop_contradicted():
                 T_optimised = graph.optimise(T_odometry)
         if isinstance(location, Location) and in_graph:
             location = replace(location, T_enu_world=graph.T_fixed_world)

@@ -20,7 +20,7 @@ LOG = "run.log"
 
 REFERENCE = "reference"
 TRAJECTORIES = {
-    "network": "raw network poses, chained",
+    "network": "poses of the networks' snippets, chained",
     "odometry": "front end fused, no loops",
     "optimised": "after the pose graph",
     "lidar": "KISS-ICP on the LiDAR scans",

@@ -135,6 +135,21 @@ def test_a_loop_contradicted_by_the_rest_is_dropped():
     graph = PoseGraph()
     graph.add_relative(*odometry, *skips, *loops, false)
     graph.optimise(initial)
-    assert graph.drop_contradicted_loops() == (false,) == tuple(graph.dropped)
+    assert graph.drop_contradicted() and graph.dropped == [false]
     graph.optimise(initial)
-    assert graph.drop_contradicted_loops() == () and len(graph.relative_poses) == len(odometry + skips + loops)
+    assert not graph.drop_contradicted() and len(graph.relative_poses) == len(odometry + skips + loops)
+
+
+def test_positions_far_from_all_others_are_dropped():
+    truth, odometry, skips, _, initial = noisy_problem()
+    rng = np.random.default_rng(3)
+    frames = np.arange(0, len(truth), 4)
+    places = truth[frames, :3, 3] + rng.normal(scale=0.05, size=(len(frames), 3))
+    places[10:14] += [0.0, 0.0, 20.0]
+    graph = PoseGraph()
+    graph.add_relative(*odometry, *skips)
+    graph.add_positions(frames, places, np.full((len(frames), 3), 0.05), np.eye(4))
+    before = ate(graph.T_fixed_world @ graph.optimise(initial), truth)
+    assert graph.drop_contradicted()
+    after = ate(graph.T_fixed_world @ graph.optimise(initial), truth)
+    assert after < 0.08 and 2 * after < before and not graph.drop_contradicted()

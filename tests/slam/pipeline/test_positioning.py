@@ -82,16 +82,17 @@ def test_exact_fixes_give_scale_and_place() -> None:
     assert np.linalg.norm(LocalFrame(PLACE).points(places) - LocalFrame(PLACE).points(true), axis=1).max() < 0.1
 
 
-def test_gps_holds_a_drifting_odometry_despite_outliers() -> None:
+@pytest.mark.parametrize("correlation_s", [0, 10])
+def test_gps_holds_a_drifting_odometry_despite_outliers(correlation_s: int) -> None:
     noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=1)
     gps = track(np.random.default_rng(1), 0.5, outliers=8)
-    settings = ("gps.sigma_m=0.5", "gps.vertical_sigma_m=0.5", "gps.correlation_s=0")
+    settings = ("gps.sigma_m=0.5", "gps.vertical_sigma_m=0.5", f"gps.correlation_s={correlation_s}")
     beside, within = (run(gps, *settings, f"gps.factors={use}", noise=noise) for use in ("false", "true"))
     assert beside.scale.estimate == within.scale.estimate
     positions = [r.location.T_enu_world @ r.optimised.T_world_camera for r in (beside, within)]
     frame = within.location.fixes.frame.points(LocalFrame(PLACE).places(se3.apply(T_ENU_WORLD, path()[:, :3, 3])))
     errors = [float(np.linalg.norm(T[:, :3, 3] - frame, axis=1).mean()) for T in positions]
-    assert errors[1] < 0.5 and 2 * errors[1] < errors[0]
+    assert errors[1] < 0.45 and 2 * errors[1] < errors[0]
 
 
 def test_a_track_that_does_not_fit_is_refused() -> None:

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import load_model, take_over
-from erfsfm.common.errors import ConfigError
+from erfsfm.common.errors import ConfigError, TrainingError
 from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.processes import opencv_threads
 from erfsfm.common.progress import Progress, silent
@@ -203,10 +203,15 @@ def _fit(
             warnings.filterwarnings("ignore", message=".*dirpath has changed.*")
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint if resume else None, weights_only=True)
-    except SystemExit as error:
-        number = error.number if isinstance(error, Terminated) else signal.SIGINT  # Lightning turns ctrl-C into an exit
+    except (SystemExit, RuntimeError) as error:
+        at = f"at step {trainer.global_step}"
         next_time = "continue with --resume" if checkpoint.is_file() else "start again, for it has no checkpoint yet"
-        raise Terminated(number, f" at step {trainer.global_step}: {next_time}") from error
+        if isinstance(error, SystemExit):  # Lightning turns ctrl-C into one
+            number = error.number if isinstance(error, Terminated) else signal.SIGINT
+            raise Terminated(number, f" {at}: {next_time}") from error
+        if "DataLoader worker" in str(error):
+            raise TrainingError(f"a data loader process was killed {at}: is there enough memory? {next_time}") from error
+        raise
 
 
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:

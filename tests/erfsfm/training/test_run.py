@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import multiprocessing
 import os
 import pickle
 import shutil
@@ -386,6 +387,23 @@ def test_a_signal_ends_a_training_in_order(
         train(config, tmp_path / "run", device="cpu")
     assert ended.value.code == code and ("--resume" in str(ended.value)) == (name == "SIGHUP")
     assert load_model(tmp_path / "run" / "last").record.step == 1
+
+
+@pytest.mark.slow
+def test_a_loader_that_is_killed_is_said_in_one_line(
+    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = SelfSupervision.training_step
+
+    def killing(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        for child in multiprocessing.active_children():
+            child.kill()
+            child.join()
+        return original(self, batch, index)
+
+    monkeypatch.setattr(SelfSupervision, "training_step", killing)
+    with pytest.raises(TrainingError, match="loader process was killed at step .* memory"):
+        train(alone(data={"workers": 1}), tmp_path / "run", device="cpu")
 
 
 # refusals

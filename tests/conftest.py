@@ -36,6 +36,16 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+@pytest.fixture
+def as_in_the_foreground() -> Generator[None]:
+    """What a shell starts in the background ignores SIGINT; nohup ignores SIGHUP."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _separate_home(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Keep evo and others from leaving settings in the user's home."""

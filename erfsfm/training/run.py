@@ -210,7 +210,7 @@ def _fit(
             number = error.number if isinstance(error, Terminated) else signal.SIGINT
             raise Terminated(number, f" {at}: {next_time}") from error
         if "DataLoader worker" in str(error):
-            raise TrainingError(f"a data loader process was killed {at}: is there enough memory? {next_time}") from error
+            raise TrainingError(f"a data loader was killed {at}: is there enough memory? {next_time}") from error
         raise
 
 

@@ -293,6 +293,7 @@ def test_a_stage_that_fails_costs_its_results(
     assert (tmp_path / "run/graph.g2o").is_file() == (stage != "graph")
 
 
+@pytest.mark.usefixtures("as_in_the_foreground")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_during_the_pass_leaves_a_whole_run_of_what_was_seen(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str

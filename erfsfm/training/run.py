@@ -91,8 +91,7 @@ def train(
     if config.data.validation and not validation and rank == 0:
         logger.warning("training runs without validation: no recording of data.validation is among the data")
     lightning.seed_everything(config.training.seed, verbose=False)
-    minutes = config.training.minutes
-    timer = Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)  # keeps its time in checkpoints
+    timer = Timer(timedelta(minutes=config.training.minutes) or None, verbose=False)  # keeps its time in checkpoints
     module = SelfSupervision(config, timer.time_elapsed)
     draws = _draws(config, training, done_steps, output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
@@ -198,20 +197,16 @@ def _fit(
     try:
         with opencv_threads(1), warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
-            warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
-            warnings.filterwarnings("ignore", message=".*when using `ckpt_path`.*")
-            warnings.filterwarnings("ignore", message=".*dirpath has changed.*")
-            warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
+            warnings.filterwarnings("ignore", ".*(treespec|ckpt_path|dirpath has|Checkpoint directory|logs directory)")
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint if resume else None, weights_only=True)
     except (SystemExit, RuntimeError) as error:
-        at = f"at step {trainer.global_step}"
-        next_time = "continue with --resume" if checkpoint.is_file() else "start again, for it has no checkpoint yet"
+        again = "continue with --resume" if checkpoint.is_file() else "start again, for it has no checkpoint yet"
         if isinstance(error, SystemExit):  # Lightning turns ctrl-C into one
-            number = error.number if isinstance(error, Terminated) else signal.SIGINT
-            raise Terminated(number, f" {at}: {next_time}") from error
-        if "DataLoader worker" in str(error):
-            raise TrainingError(f"a data loader was killed {at}: is there enough memory? {next_time}") from error
-        raise
+            number = getattr(error, "number", signal.SIGINT)
+            raise Terminated(number, f" at step {trainer.global_step}: {again}") from error
+        if "DataLoader worker" not in str(error):
+            raise
+        raise TrainingError(f"a data loader was killed: is there enough memory? {again}") from error
 
 
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:

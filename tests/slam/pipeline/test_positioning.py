@@ -82,7 +82,7 @@ def test_exact_fixes_give_scale_and_place() -> None:
     assert np.linalg.norm(LocalFrame(PLACE).points(places) - LocalFrame(PLACE).points(true), axis=1).max() < 0.1
 
 
-@pytest.mark.parametrize("correlation_s", [0, 10])
+@pytest.mark.parametrize("correlation_s", [0, pytest.param(10, marks=pytest.mark.slow)])
 def test_gps_holds_a_drifting_odometry_despite_outliers(correlation_s: int) -> None:
     noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=1)
     gps = track(np.random.default_rng(1), 0.5, outliers=8)

@@ -56,7 +56,7 @@ class SegmentErrors:
 def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     """Estimates brought to the reference by the best similarity of positions (Umeyama 1991).
 
-    Without a reference they stay as written, only that of the networks is brought to the optimised one's scale.
+    Without a reference they stay as written, only the network trajectory is brought to the optimised one's scale.
     """
     drawn = dict(trajectories)
     if REFERENCE in drawn:

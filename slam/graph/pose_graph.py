@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +61,6 @@ class PoseGraph:
         self.T_fixed_world: FloatArray = np.eye(4)
         self._T_world_camera: FloatArray | None = None
         self._positions: list[tuple[int, FloatArray, FloatArray]] = []  # frame, position, sigmas
-
-    @property
-    def errors(self) -> FloatArray:
-        """Whitened squared residual ``(F,)`` of each factor at the optimised trajectory."""
-        return whitened_squared(self.relative_poses, self._solution())
 
     def add_relative(self, *relative_poses: RelativePose) -> None:
         """Add measurements as factors.
@@ -132,18 +128,18 @@ class PoseGraph:
         Returns:
             Whether one was dropped: optimise again.
         """
-        loops = [edge for edge in self.relative_poses if edge.source == LOOP_SOURCE]
-        wrong_loops = _outlying(whitened_squared(loops, self._solution()))
-        gone = [edge for edge, is_wrong in zip(loops, wrong_loops, strict=True) if is_wrong]
-        self.relative_poses = [edge for edge in self.relative_poses if not any(edge is each for each in gone)]
-        self.dropped += gone
-        placed = (self.T_fixed_world @ self._solution())[:, :3, 3]
-        squared = [float((((placed[k] - where) / sigmas) ** 2).sum()) for k, where, sigmas in self._positions]
-        wrong = _outlying(np.array(squared))
-        self._positions = [each for each, is_wrong in zip(self._positions, wrong, strict=True) if not is_wrong]
-        if wrong.any():
-            logger.warning("%d of %d positions contradict the others: left out", wrong.sum(), len(wrong))
-        return bool(gone) or bool(wrong.any())
+        T_world_camera = self._solution()
+        is_wrong = np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
+        is_wrong[is_wrong] = _outlying(whitened_squared(compress(self.relative_poses, is_wrong), T_world_camera))
+        self.dropped += compress(self.relative_poses, is_wrong)
+        self.relative_poses = list(compress(self.relative_poses, ~is_wrong))
+        placed = (self.T_fixed_world @ T_world_camera)[:, :3, 3]
+        squared = [float((((placed[k] - position) / own) ** 2).sum()) for k, position, own in self._positions]
+        is_stray = _outlying(np.array(squared))
+        self._positions = list(compress(self._positions, ~is_stray))
+        if is_stray.any():
+            logger.warning("%d of %d positions contradict the others: left out", is_stray.sum(), len(is_stray))
+        return bool(is_wrong.any() or is_stray.any())
 
     def marginal(self, frame: int) -> FloatArray:
         """Covariance ``(6, 6)`` of a frame's pose at the optimised trajectory, with the first frame fixed.
@@ -226,7 +222,7 @@ def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: Flo
 
 def _outlying(squared: FloatArray) -> NDArray[np.bool_]:
     """Which whitened squared residuals ``(F,)`` are large by themselves, and far above the median."""
-    typical = float(np.sqrt(np.median(squared))) if len(squared) else 0.0
+    typical = float(np.median(np.sqrt(squared))) if len(squared) else 0.0
     return np.asarray(squared > max(_LARGEST_RESIDUAL, _OUTLYING * typical) ** 2)
 
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # Plotly is for runs with a report, and for their end
     from slam.results.report.figures import MapView
 
 _ALIGNED = "Each estimate is aligned to the ground truth by rotation, translation and one scale."
-_AS_WRITTEN = "As written; no ground truth is known. That of the networks is scaled to the rest."
+_AS_WRITTEN = "As written; no ground truth is known. The network trajectory is scaled to the rest."
 _TEMPLATES = Environment(
     loader=PackageLoader("slam", "results/report"),
     autoescape=True,

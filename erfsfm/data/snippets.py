@@ -7,8 +7,10 @@ augmentation. A run resumed at step k therefore draws the same samples as an uni
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -46,11 +48,12 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._first_draw = first_draw
         self._rank = rank
         size = (config.network.height, config.network.width)
-        depth_mb = config.data.cache_mb // 5 if config.data.exact > 0 or config.teacher.exact else 0
+        depth_mb = config.data.cache_mb // 5 if config.data.exact > 0 or config.teacher.exact or imitated else 0
         images_mb = config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
         self._cache = ArrayCache(images_mb, (*size, 3), np.uint8)
         self._unreadable: set[str] = set()
-        self._exact_labels = ExactLabels(size, depth_mb)
+        self._depth = ArrayCache(depth_mb, size, np.float32)  # true depth, inverse depth that is imitated
+        self._exact_labels = ExactLabels(self._depth)
         self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
@@ -93,7 +96,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             return single_image(image, camera, bounds, self._config, rng)
         snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
         camera = self._camera(snippet.recording)
-        seen = self._structure(snippet, images, camera)
+        seen = self._structure(snippet, camera)
         if self._config.single_images:
             assert seen is not None, "there are labels"
             return single_image(images[0], camera, (seen.least, seen.most), self._config, rng)
@@ -122,15 +125,26 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 starts = range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
             yield Snippet(recording, starts[int(rng.integers(len(starts)))])
 
-    def _structure(self, snippet: Snippet, images: list[NDArray[np.uint8]], camera: Camera) -> TeacherStructure | None:
+    def _structure(self, snippet: Snippet, camera: Camera) -> TeacherStructure | None:
         """The label of a snippet, if there is a teacher."""
         if self._imitated is not None:
-            return depth_alone(self._imitated(images[len(images) // 2]), camera, self._config)
+            target = snippet.first + self._config.network.sources // 2
+            key = (*snippet.recording.key, target)
+            inverse_depth = self._depth.get(key, partial(self._seen_by_imitated, snippet.recording, target))
+            return depth_alone(inverse_depth, camera, self._config)
         if self._many_views is not None:
             return self._many_views.structure(snippet.recording, snippet.first, self._config.network.sources)
         if self._config.teacher.exact:
             return self._exact_labels.structure(snippet.recording, snippet.first, self._config.network.sources)
         return None
+
+    def _seen_by_imitated(self, recording: Recording, index: int) -> NDArray[np.float32]:
+        """Inverse depth at the networks' size: networks see more in larger images (docs/design/learning.md)."""
+        assert self._imitated is not None, "a network is imitated"
+        (height, width), camera = self._depth.shape, recording.camera
+        image = recording.image(index, min(2 * height, camera.height), min(2 * width, camera.width))
+        inverse_depth = self._imitated(image)
+        return np.asarray(cv2.resize(inverse_depth, (width, height), interpolation=cv2.INTER_AREA))
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):
@@ -199,18 +213,17 @@ FARTHEST_M = 200.0  # what the simulator leaves unknown is sky; of a depth camer
 
 
 class ExactLabels:
-    """Labels of recordings with exact depth, in camera heights; ``size``: height and width of the images."""
+    """Labels of recordings with exact depth, in camera heights, of the size that the cache has them in."""
 
-    def __init__(self, size: tuple[int, int], cache_mb: int) -> None:
-        self._size = size
-        self._depth = ArrayCache(cache_mb, size, np.float32)
+    def __init__(self, cache: ArrayCache) -> None:
+        self._depth = cache
         self._poses: dict[tuple[str, Path], NDArray[np.float64] | None] = {}
 
     def bounds(self, recording: Recording, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Least and most inverse depth of a frame, each ``(H, W)``."""
         height_m = recording.camera_height_m
         assert height_m is not None, "recordings are exact"
-        depth_m = self._depth.get((*recording.key, index), lambda: recording.shrunk_depth(index, *self._size))
+        depth_m = self._depth.get((*recording.key, index), partial(recording.shrunk_depth, index, *self._depth.shape))
         seen = depth_m > 0
         beyond = height_m / FARTHEST_M if recording.name.startswith("simulated/") else np.inf
         most = np.where(seen, height_m / np.where(seen, depth_m, 1), beyond).astype(np.float32)

@@ -34,7 +34,7 @@ def progress_bar() -> Iterator[Progress]:
                 name = _name(stage)
                 if name not in tasks:
                     tasks[name] = bars.add_task(stage, total=total)
-                bars.update(tasks[name], completed=done, description=stage)
+                bars.update(tasks[name], completed=done, total=total, description=stage)
 
             yield update
     else:

@@ -250,10 +250,9 @@ def single_image(
     return sample | _bounds(maps, _nearer(varied, config))
 
 
-def depth_alone(inverse_depth: NDArray[np.float32], camera: Camera, config: ExperimentConfig) -> TeacherStructure:
-    """A structure of unknown motion with the inverse depth ``(H, W)`` that a network gives for an image."""
-    bound = (inverse_depth / np.float32(HEIGHTS * _nearer(camera, config))).astype(np.float16)
-    return TeacherStructure(np.full((config.network.sources, 4, 4), np.nan, np.float32), bound, bound)
+def in_heights(inverse_depth: NDArray[np.float32], camera: Camera, config: ExperimentConfig) -> NDArray[np.float32]:
+    """Inverse depth ``(H, W)`` that a network gives for an image, in camera heights."""
+    return inverse_depth / np.float32(HEIGHTS * _nearer(camera, config))
 
 
 def _nearer(camera: Camera, config: ExperimentConfig) -> float:

@@ -20,7 +20,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import DataConfig, ExperimentConfig
-from erfsfm.data.augmentation import as_tensors, depth_alone, single_image, training_sample
+from erfsfm.data.augmentation import as_tensors, in_heights, single_image, training_sample
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split import usable
@@ -96,7 +96,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             return single_image(image, camera, bounds, self._config, rng)
         snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
         camera = self._camera(snippet.recording)
-        seen = self._structure(snippet, camera)
+        seen = self._structure(snippet)
         if self._config.single_images:
             assert seen is not None, "there are labels"
             return single_image(images[0], camera, (seen.least, seen.most), self._config, rng)
@@ -125,26 +125,24 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 starts = range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
             yield Snippet(recording, starts[int(rng.integers(len(starts)))])
 
-    def _structure(self, snippet: Snippet, camera: Camera) -> TeacherStructure | None:
+    def _structure(self, snippet: Snippet) -> TeacherStructure | None:
         """The label of a snippet, if there is a teacher."""
+        recording, sources = snippet.recording, self._config.network.sources
         if self._imitated is not None:
-            target = snippet.first + self._config.network.sources // 2
-            key = (*snippet.recording.key, target)
-            inverse_depth = self._depth.get(key, partial(self._seen_by_imitated, snippet.recording, target))
-            return depth_alone(inverse_depth, camera, self._config)
+            target = snippet.first + sources // 2
+            bound = self._depth.get((*recording.key, target), partial(self._by_imitated, recording, target))
+            return TeacherStructure(np.full((sources, 4, 4), np.nan, np.float32), bound, bound)
         if self._many_views is not None:
-            return self._many_views.structure(snippet.recording, snippet.first, self._config.network.sources)
-        if self._config.teacher.exact:
-            return self._exact_labels.structure(snippet.recording, snippet.first, self._config.network.sources)
-        return None
+            return self._many_views.structure(recording, snippet.first, sources)
+        return self._exact_labels.structure(recording, snippet.first, sources) if self._config.teacher.exact else None
 
-    def _seen_by_imitated(self, recording: Recording, index: int) -> NDArray[np.float32]:
-        """Inverse depth at the networks' size: networks see more in larger images (docs/design/learning.md)."""
+    def _by_imitated(self, recording: Recording, index: int) -> NDArray[np.float32]:
+        """Inverse depth in camera heights, from a larger image: a network sees more in it (docs/design/learning.md)."""
         assert self._imitated is not None, "a network is imitated"
-        (height, width), camera = self._depth.shape, recording.camera
-        image = recording.image(index, min(2 * height, camera.height), min(2 * width, camera.width))
-        inverse_depth = self._imitated(image)
-        return np.asarray(cv2.resize(inverse_depth, (width, height), interpolation=cv2.INTER_AREA))
+        (height, width), stored = self._depth.shape, recording.camera
+        image = recording.image(index, min(2 * height, stored.height), min(2 * width, stored.width))
+        inverse_depth = cv2.resize(self._imitated(image), (width, height), interpolation=cv2.INTER_AREA)
+        return in_heights(np.asarray(inverse_depth), self._camera(recording), self._config)
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):

@@ -189,17 +189,13 @@ class StepProgress(Callback):
         self._began: tuple[int, float] | None = None
         self._said = False
 
-    def on_train_start(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Tell that the steps begin."""
-        if trainer.is_global_zero:
-            self._progress("steps", trainer.global_step, trainer.max_steps)
-
     def on_train_batch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any) -> None:
         """Tell of a step."""
         assert isinstance(module, SelfSupervision)
         if not trainer.is_global_zero:
             return
-        step, steps, now_s = trainer.global_step, trainer.max_steps, time.monotonic()
+        step, now_s = trainer.global_step, time.monotonic()
+        steps = round(step / module.progress(step))  # fewer than asked for where the time ends before
         first, began_s = self._began = self._began or (step, now_s)
         timed = step - first >= min(_TIMED_STEPS, steps - first) or now_s - began_s >= _TIMED_S
         if timed and step > first and not self._said:

@@ -136,7 +136,7 @@ class SelfSupervision(lightning.LightningModule):
         slowly = slowly[: 2 if pretrained else 1]
         optimiser = torch.optim.Adam([{"params": rest}, *slowly], lr=training.learning_rate, betas=(0.9, 0.999))
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimiser, lambda step: learning_rate_factor(training.schedule, self._progress(step), step)
+            optimiser, lambda step: learning_rate_factor(training.schedule, self.progress(step), step)
         )
         self._rates = list(schedule.base_lrs)
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
@@ -146,12 +146,12 @@ class SelfSupervision(lightning.LightningModule):
         schedule: Any = self.lr_schedulers()
         schedule.base_lrs = self._rates
         done = schedule.last_epoch
-        factor = learning_rate_factor(self.config.training.schedule, self._progress(done), done)
+        factor = learning_rate_factor(self.config.training.schedule, self.progress(done), done)
         for group, rate in zip(schedule.optimizer.param_groups, self._rates, strict=True):
             group["initial_lr"] = rate
             group["lr"] = rate * factor
 
-    def _progress(self, step: int) -> float:
+    def progress(self, step: int) -> float:
         """Fraction of the run that is done, by steps or by time, whichever is farther."""
         training = self.config.training
         by_time = self._clock() / (60 * training.minutes) if training.minutes else 0.0

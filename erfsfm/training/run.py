@@ -100,7 +100,10 @@ def train(
     keeper = WeightKeeper(output, seen, command, bool(validation), config.training, choose_device(device))
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
-    loader = _loader(draws, config, pin_memory=not on_cpu)
+    batch, count = config.training.batch, config.data.workers
+    loader = DataLoader(
+        draws, batch, num_workers=count, pin_memory=not on_cpu, collate_fn=stacked, persistent_workers=count > 0
+    )
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     with raising_on_termination(), FolderLock() as lock:
         if rank == 0:
@@ -166,18 +169,6 @@ def _draws(
     imitates = config.teacher.views == "network"
     imitated = partial(learned_inverse_depth, config.teacher.slam_weights) if imitates else None
     return SnippetDraws(training, config, last, done, LightningEnvironment().local_rank(), views, imitated)
-
-
-def _loader(draws: SnippetDraws, config: ExperimentConfig, pin_memory: bool) -> DataLoader[dict[str, Tensor]]:
-    workers = config.data.workers
-    return DataLoader(
-        draws,
-        config.training.batch,
-        num_workers=workers,
-        pin_memory=pin_memory,
-        collate_fn=stacked,
-        persistent_workers=workers > 0,
-    )
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:

@@ -286,7 +286,9 @@ def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
     timed = configure(small, roots, training={**three.training.model_dump(), "steps": 1000, "minutes": 0.05})
     train(three, tmp_path / "three", device="cpu")
     Clock(monkeypatch)
-    train(timed, tmp_path / "timed", device="cpu")
+    told: list[tuple[int, int]] = []
+    train(timed, tmp_path / "timed", device="cpu", progress=lambda stage, done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)], "of the steps that there is time for"
     record = load_model(tmp_path / "timed" / "last").record
     assert record.step == 3 and "abs_rel" in record.metrics, "the end is validated"
     assert same(tmp_path / "timed" / "last", tmp_path / "three" / "last")

@@ -197,7 +197,7 @@ def _fit(
             raise Terminated(number, f" at step {trainer.global_step}: {again}") from error
         if "DataLoader worker" not in str(error):
             raise
-        raise TrainingError(f"a data loader was killed: is there enough memory? {again}") from error
+        raise TrainingError(f"a data loader was killed, for want of memory or by a signal: {again}") from error
 
 
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:

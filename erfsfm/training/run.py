@@ -60,7 +60,7 @@ def train(
     command: str = "",
     progress: Progress = silent,
 ) -> Path:
-    """Train, validate, keep the best; with several devices Lightning starts further processes, which exit here.
+    """Train, validate, keep the best in the folder that is returned; further processes of several devices exit here.
 
     Args:
         config: the experiment.
@@ -71,9 +71,6 @@ def train(
         device: ``auto``, ``cpu`` or ``cuda``.
         command: recorded in the weights.
         progress: told of the stage, what is done, and of how many.
-
-    Returns:
-        The output folder.
 
     Raises:
         ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
@@ -100,9 +97,8 @@ def train(
     keeper = WeightKeeper(output, seen, command, bool(validation), config.training, choose_device(device))
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
-    batch, count = config.training.batch, config.data.workers
     loader = DataLoader(
-        draws, batch, num_workers=count, pin_memory=not on_cpu, collate_fn=stacked, persistent_workers=count > 0
+        draws, config.training.batch, num_workers=config.data.workers, pin_memory=not on_cpu, collate_fn=stacked
     )
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     with raising_on_termination(), FolderLock() as lock:

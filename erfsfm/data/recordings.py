@@ -24,8 +24,7 @@ from erfsfm.geometry import Camera
 
 logger = logging.getLogger(__name__)
 
-# of this process: the frames ``(N, height, width, 3)`` of each video by their height and width
-_kept: dict[Path, dict[tuple[int, int], Image]] = {}
+_kept: dict[Path, Image] = {}  # of this process: the frames ``(N, height, width, 3)`` of each video at one size
 
 
 class Video:
@@ -49,15 +48,16 @@ class Video:
 
     def image(self, index: int, height: int, width: int) -> Image:
         """One frame ``(height, width, 3)`` uint8 RGB, resized without crop."""
-        kept = _kept.setdefault(self.path, {})
-        if (height, width) not in kept:
+        frames = _kept.get(self.path)
+        if frames is None or frames.shape[1:3] != (height, width):
             decoded = VideoFrames(self.path, counted_frames=0)
             with tempfile.TemporaryFile(prefix="erfsfm-video-") as file:
                 for number in range(self._length):
                     file.write(resize_image(decoded.read(number), height, width).tobytes())
                 file.flush()
-                kept[height, width] = np.memmap(file, np.uint8, "r", shape=(self._length, height, width, 3))
-        return np.array(kept[height, width][index])
+                frames = np.memmap(file, np.uint8, "r", shape=(self._length, height, width, 3))
+            _kept[self.path] = frames
+        return np.array(frames[index])
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         """Inverse depth in camera heights, from a larger image: a network sees more in it (docs/design/learning.md)."""
         assert self._imitated is not None, "a network is imitated"
         (height, width), stored = self._depth.shape, recording.camera
-        image = recording.image(index, min(2 * height, stored.height), min(2 * width, stored.width))
+        larger = min(2 * height, stored.height), min(2 * width, stored.width)
+        # a video has all of its frames decoded at one size
+        image = recording.image(index, *(larger if recording.video is None else (height, width)))
         inverse_depth = cv2.resize(self._imitated(image), (width, height), interpolation=cv2.INTER_AREA)
         return in_heights(np.asarray(inverse_depth), self._camera(recording), self._config)
 

@@ -137,12 +137,11 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         return self._exact_labels.structure(recording, snippet.first, sources) if self._config.teacher.exact else None
 
     def _by_imitated(self, recording: Recording, index: int) -> NDArray[np.float32]:
-        """Inverse depth in camera heights, from a larger image: a network sees more in it (docs/design/learning.md)."""
+        """Inverse depth in camera heights; of a file as it is stored, in which a network sees more."""
         assert self._imitated is not None, "a network is imitated"
         (height, width), stored = self._depth.shape, recording.camera
-        larger = min(2 * height, stored.height), min(2 * width, stored.width)
         # a video has all of its frames decoded at one size
-        image = recording.image(index, *(larger if recording.video is None else (height, width)))
+        image = recording.image(index, *((stored.height, stored.width) if recording.video is None else (height, width)))
         inverse_depth = cv2.resize(self._imitated(image), (width, height), interpolation=cv2.INTER_AREA)
         return in_heights(np.asarray(inverse_depth), self._camera(recording), self._config)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from erfsfm.config import ExperimentConfig
@@ -165,16 +165,22 @@ def test_the_label_is_what_the_network_gives_for_the_larger_image(
 ) -> None:
     config = imitation(write_root(tmp_path / "real", 3))
     (recording,), _ = split_recordings(config.data)
-    draws = SnippetDraws([recording], config, 1, imitated=partial(learned_inverse_depth, "sim"))
+    seen = []
+
+    def imitated(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        seen.append(image)
+        return learned_inverse_depth("sim", image)
+
+    draws = SnippetDraws([recording], config, 1, imitated=imitated)
     sample = draws.draw(0)
-    whole = recording.image(1, 64, 96)
-    disparity = (
-        1 / DepthPosePredictor.from_weights("sim", "cpu", "onnx").depth(whole)[:, ::-1]
-    )  # every image is mirrored
+    stored = recording.image(1, 64, 96)
+    depth = DepthPosePredictor.from_weights("sim", "cpu", "onnx").depth(stored)
+    disparity = 1 / depth[:, ::-1]  # every image is mirrored
     torch.testing.assert_close(sample["least"], sample["most"])
     wanted = torch.from_numpy(disparity.reshape(32, 2, 48, 2).mean((1, 3)))[None] / HEIGHTS
     torch.testing.assert_close(sample["most"], wanted, rtol=2e-3, atol=1e-4)
-    torch.testing.assert_close(draws.draw(0)["most"], sample["most"], rtol=0, atol=0)  # kept
+    torch.testing.assert_close(draws.draw(0)["most"], sample["most"], rtol=0, atol=0)
+    assert len(seen) == 1, "the label is kept"
 
 
 def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path) -> None:

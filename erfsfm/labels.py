@@ -133,10 +133,10 @@ def shrunk(least: Array, most: Array, factor: int) -> tuple[Array, Array]:
         return least, most
     height, width = (length // factor for length in least.shape)
     both = (least > 0) & np.isfinite(most)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # a bound that is not known is 0 or infinite
         low, high, middle = (
             values.reshape(height, factor, width, factor).swapaxes(1, 2).reshape(height, width, -1)
-            for values in (np.log(least), np.log(most), np.where(both, np.log(np.where(both, least * most, 1)) / 2, 0))
+            for values in (np.log(least), np.log(most), np.where(both, np.log(least * most) / 2, 0))
         )
     spread = np.ptp(middle, axis=-1) / 2
     both = np.isfinite(low).all(-1) & np.isfinite(high).all(-1)

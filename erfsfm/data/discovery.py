@@ -6,6 +6,7 @@ with missing frame numbers is split there, so that no snippet spans a gap in tim
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,7 @@ from erfsfm.data.recordings import Recording, Video, split_at_gaps
 from erfsfm.geometry import Camera
 
 INDOOR_HEIGHT_M = 0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
-_COLOUR = (2, 3)
+logger = logging.getLogger(__name__)
 Number = TypeVar("Number", int, str)
 
 
@@ -119,7 +120,7 @@ def open_drive(drive: Path) -> list[Recording]:
 
 def _cameras(folders: dict[Number, Path]) -> Iterator[tuple[Number, NumberedFiles, tuple[int, int]]]:
     """Images of the colour cameras, else of the first of the grey ones, with their height and width."""
-    colour = [camera for camera in folders if int(camera) in _COLOUR]
+    colour = [camera for camera in folders if int(camera) in (2, 3)]
     for camera in colour or list(folders)[:1]:
         images = list_images(folders[camera])
         if not images:
@@ -134,8 +135,7 @@ def _own(root: Path) -> list[Recording]:
     home = root.parent if is_video else root
     if not (home / CAMERA_FILE).is_file():
         return []
-    written = read_camera_file(home / CAMERA_FILE)
-    if written.is_distorted:
+    if (written := read_camera_file(home / CAMERA_FILE)).is_distorted:
         raise DataError(f"{home / CAMERA_FILE} describes a distorted camera: undistort the images before training")
     camera = Camera.of(written.pinhole)
     images: list[Path] = []
@@ -148,7 +148,14 @@ def _own(root: Path) -> list[Recording]:
         return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
     files = by_name(images)
     whole = Recording(f"folder/{recording_name(home)}", files.paths, camera)
-    depth = tuple(home / "depth" / f"{path.stem}.png" for path in files.paths)
-    if all(path.is_file() for path in depth):  # as a depth camera measures it
-        whole = replace(whole, depth=depth, camera_height_m=written.height_or(None) or INDOOR_HEIGHT_M)
+    maps = (home if recording_name(home) == home.name else home.parent) / "depth"
+    depth = tuple(maps / f"{path.stem}.png" for path in files.paths)
+    missing = [path.name for path in depth if not path.is_file()]
+    if not missing:  # as a depth camera measures it
+        if written.depth_per_metre is None:
+            raise DataError(f"{home / CAMERA_FILE}: add depth_per_metre, the value of one metre in {maps}: 1000 in mm")
+        height_m = written.height_or(None) or INDOOR_HEIGHT_M
+        whole = replace(whole, depth=depth, depth_per_metre=written.depth_per_metre, camera_height_m=height_m)
+    elif len(missing) < len(depth):
+        logger.warning("%s is not used: it has no %s; move the images without depth away", maps, missing[0])
     return split_at_gaps(whole, files)

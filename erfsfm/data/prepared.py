@@ -99,6 +99,7 @@ def write_prepared(
         progress: told of the stage, what is done, and of how many.
     """
     length, middle = network.sources + 1, network.sources // 2
+    size = network.height, network.width
     snippets = [snippet.recording.part(snippet.first, snippet.first + length) for snippet in held_out]
     recordings = [*training, *snippets]
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
@@ -108,19 +109,15 @@ def write_prepared(
             progress("frames", number, len(recordings))
             folder = unfinished / f"{number:04d}"
             unreadable += _write_images(folder, recording, network)
-            if number >= len(training):
-                depth_file = recording.depth[middle] if recording.depth else None
-                if depth_file is not None:  # of the middle frame, as it is stored
-                    written = _file(folder, "depth", recording.start + middle)
-                    write_atomically(written, depth_file.read_bytes(), sync=False)
-                if (T_world_camera := recording.true_poses()) is not None:
-                    np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
-            elif recording.exact:
-                for index in range(len(recording)):
-                    depth = np.rint(recording.shrunk_depth(index, network.height, network.width) * 256)
-                    path = _file(folder, "depth", recording.start + index)
-                    write_atomically(path, bytes(cv2.imencode(".png", depth.astype(np.uint16))[1]), sync=False)
-            elif teacher is not None:
+            validated = number >= len(training)
+            for index in [middle] if validated else range(len(recording)) if recording.exact else []:
+                depth = recording.true_depth(index) if validated else recording.shrunk_depth(index, *size)
+                if depth is not None:
+                    written = cv2.imencode(".png", np.rint(depth * 256).astype(np.uint16))[1]
+                    write_atomically(_file(folder, "depth", recording.start + index), bytes(written), sync=False)
+            if validated and (T_world_camera := recording.true_poses()) is not None:
+                np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
+            elif not validated and not recording.exact and teacher is not None:
                 _write_labels(teacher.drive(recording), folder / _LABELS, network)
         report_unreadable(unreadable, sum(map(len, recordings)), "images")
         entries = [

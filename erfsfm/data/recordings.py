@@ -79,6 +79,7 @@ class Recording:
     camera: Camera
     video: Video | None = None
     depth: tuple[Path | None, ...] | None = None
+    depth_per_metre: float = 256.0  # KITTI's
     poses_file: Path | None = None
     camera_height_m: float | None = None
     t_camera_cam0: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -136,7 +137,7 @@ class Recording:
     def true_depth(self, index: int) -> NDArray[np.float32] | None:
         """z-depth in metres ``(H, W)``, 0 where unknown; None where the frame has no depth."""
         path = None if self.depth is None else self.depth[index]
-        return None if path is None else read_depth_map(path).astype(np.float32)
+        return None if path is None else read_depth_map(path, self.depth_per_metre).astype(np.float32)
 
     def shrunk_depth(self, index: int, height: int, width: int) -> NDArray[np.float32]:
         """As `true_depth` of a frame that has it, by the nearest pixels at another size, of ``image`` as a rule."""

@@ -45,6 +45,7 @@ class CameraFile(BaseModel):
     readout_ms: float = Field(
         default=0.0, ge=0, description="time from the first row of an image to the last, milliseconds (rolling shutter)"
     )
+    depth_per_metre: float | None = Field(default=None, gt=0, description="value of one metre in the maps of depth/")
     source: str | None = Field(default=None, description="a note on where the numbers come from")
 
     @model_validator(mode="after")

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
+from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.augmentation import FOCAL_LENGTH
 from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
@@ -119,18 +120,27 @@ def test_a_prepared_folder_trains_without_the_worlds(
     assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["simulated/1", "kitti_odometry/00[0:12]"]
 
 
+@pytest.mark.parametrize("where", [".", "images"])
 def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
-    mixed: Callable[..., ExperimentConfig], write_root: Callable[..., Path], tmp_path: Path
+    mixed: Callable[..., ExperimentConfig],
+    write_root: Callable[..., Path],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    where: str,
 ) -> None:
     folder = tmp_path / "office"
     (folder / "depth").mkdir(parents=True)
     (folder / "images").mkdir()
-    depth = np.full((64, 96), 512, np.uint16)  # 2 m
+    depth = np.full((64, 96), 2000, np.uint16)  # millimetres
     depth[:32] = 0
     for index in range(6):
         cv2.imwrite(str(folder / "images" / f"{index:06d}.png"), np.full((64, 96, 3), 30 * index, np.uint8))
         cv2.imwrite(str(folder / "depth" / f"{index:06d}.png"), depth)
-    (folder / "camera.yaml").write_text("width: 96\nheight: 64\nfx: 90\nfy: 90\ncx: 48\ncy: 32\nfps: 5\n")
+    camera = "width: 96\nheight: 64\nfx: 90\nfy: 90\ncx: 48\ncy: 32\nfps: 5\n"
+    (folder / where / "camera.yaml").write_text(camera)
+    with pytest.raises(DataError, match="add depth_per_metre"):
+        discover(folder)
+    (folder / where / "camera.yaml").write_text(camera + "depth_per_metre: 1000\n")
     config = mixed((folder, tmp_path / "real"), weights={"folder": 1, "kitti": 1})
     recordings, _ = split_recordings(config.data)
     draws = SnippetDraws(recordings, config, 8, imitated=lambda image: np.ones(image.shape[:2], np.float32))
@@ -138,6 +148,9 @@ def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
     nearer = 90 / SIZE[0] / FOCAL_LENGTH
     assert torch.isinf(sample["most"][0, :32]).all()
     torch.testing.assert_close(sample["least"][0, 32:], torch.full((32, 96), INDOOR_HEIGHT_M / 2 * nearer))
+    (folder / "depth" / "000003.png").unlink()
+    assert not discover(folder)[0].exact
+    assert "000003.png" in caplog.text
 
 
 def test_worlds_are_drawn_by_their_weight(world: Path, mixed: Callable[..., ExperimentConfig]) -> None:

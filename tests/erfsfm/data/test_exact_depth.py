@@ -122,11 +122,7 @@ def test_a_prepared_folder_trains_without_the_worlds(
 
 @pytest.mark.parametrize("where", [".", "images"])
 def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
-    mixed: Callable[..., ExperimentConfig],
-    write_root: Callable[..., Path],
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    where: str,
+    mixed: Callable[..., ExperimentConfig], tmp_path: Path, caplog: pytest.LogCaptureFixture, where: str
 ) -> None:
     folder = tmp_path / "office"
     (folder / "depth").mkdir(parents=True)

@@ -6,6 +6,7 @@ augmentation. A run resumed at step k therefore draws the same samples as an uni
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from erfsfm.data.split import usable
 from erfsfm.data.window import ArrayCache, Snippet, TeacherStructure, first_readable, load_window, snippet_motion
 from erfsfm.geometry import Camera
 
+logger = logging.getLogger(__name__)
 _VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
 
 
@@ -59,25 +61,24 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self.recordings = usable(recordings, length)
         self._exact, self._measured = by_label(self.recordings, config)
         weights = config.data.weights
+        names = list(dict.fromkeys(recording.name for recording in self.recordings))
         for prefix in weights:
-            if not any(recording.name.startswith(prefix) for recording in self.recordings):
+            if not any(name.startswith(prefix) for name in names):
                 raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
-        for recording in self.recordings:
-            if weights and not recording.name.startswith(tuple(weights)):
-                raise DataError(
-                    f"data.weights gives '{recording.name}' no weight: name it there, or leave its data set out"
-                )
-        windows = [len(recording) - length + 1 for recording in self._measured]
-        self._probabilities = chances(self._measured, windows, weights)
-        # a long world is as good as a short one
-        self._exact_probabilities = chances(self._exact, [1] * len(self._exact), weights)
+        for name in names:
+            if weights and not name.startswith(tuple(weights)):
+                raise DataError(f"data.weights gives '{name}' no weight: name it there, or leave its data set out")
+        if self._exact:
+            others = ", ".join(dict.fromkeys(recording.name for recording in self._measured))
+            logger.info("%d recordings teach by their exact depth; the others are %s", len(self._exact), others)
+        self._probabilities = chances(self._measured, [len(one) - length + 1 for one in self._measured], weights)
+        self._exact_probabilities = chances(self._exact, [1] * len(self._exact), weights)  # however long they are
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
         index, count = (worker.id, worker.num_workers) if worker else (0, 1)
         batch, processes = self._config.training.batch, self._config.training.devices
-        mine = self._first_draw + self._rank * batch
-        for number, first in enumerate(range(mine, self._draws, batch * processes)):
+        for number, first in enumerate(range(self._first_draw + self._rank * batch, self._draws, batch * processes)):
             if number % count == index:
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
@@ -182,8 +183,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
             sample["depth"] = torch.from_numpy(depth)
         T_world_camera = recording.true_poses()
         if T_world_camera is not None:
-            motion = snippet_motion(T_world_camera, snippet.first, network.sources)
-            sample["T_source_target"] = torch.from_numpy(motion)
+            sample["T_source_target"] = torch.from_numpy(snippet_motion(T_world_camera, snippet.first, network.sources))
         return sample
 
     def _read(self, snippet: Snippet) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32] | None]:

@@ -22,16 +22,7 @@ from slam.simulation.house import Interior
 from slam.simulation.objects import person
 from slam.simulation.options import Motion, SimulationOptions
 from slam.simulation.texture import GLOWING
-from slam.simulation.world import (
-    SHUTTER,
-    Hits,
-    SimulatedWorld,
-    Surface,
-    distances,
-    place_rays,
-    square_camera,
-    through_lens,
-)
+from slam.simulation.world import SHUTTER, Hits, SimulatedWorld, Surface, place_rays, square_camera, through_lens
 
 CELL = 0.08  # metres
 _CLEAR_M = 0.44  # of a path's cells from walls and furniture, which begin up to a cell nearer
@@ -52,7 +43,6 @@ _RAYS = 48  # around a corner
 _BOUNCES = 3
 _ALBEDO = 0.55
 _REACH_M = 9.0  # of a lamp
-_BOARD_M2, _NEAR_M, _NEAR_TRIED = 0.08, (0.25, 1.6), 4000  # of half a board; to the eye, in plan; views drawn
 
 
 class Floor:
@@ -166,7 +156,7 @@ GAITS: dict[str, Gait] = {
     "drone": Gait((1.0, 1.25), 0.2, 0.9, 70.0, (0.6, 0.5, 0.3), 0.0, 0.05, 30.0, 0.15, -5.0),
     "robot": Gait((0.32, 0.45), 0.0, 0.5, 60.0, (0.8, 0.0, 0.3), 0.0, 0.0, 0.0, 0.04, 4.0),
 }
-assert (*GAITS, "near") == get_args(Motion)
+assert tuple(GAITS) == get_args(Motion)
 
 
 class Carried:
@@ -205,45 +195,12 @@ class Carried:
 
     def poses(self, seconds: FloatArray) -> FloatArray:
         """``T_scene_camera`` at times ``(N,)``, ``(N, 4, 4)``."""
-        return _posed(self.at(seconds))
-
-
-class NearViews:
-    """Views of tables, shelves and seats from near, each by itself: images to train on, no drive."""
-
-    def __init__(self, interior: Interior, count: int, rate: float, seed: int) -> None:
-        rng, surface, self._rate = np.random.default_rng([seed, 59]), Surface(interior.mesh), rate
-        corners = interior.mesh.vertices[interior.mesh.triangles].astype(float)  # (T, 3, 3)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area, height = 0.5 * np.linalg.norm(normals, axis=1), corners[..., 2].mean(axis=1)
-        boards = (np.abs(normals[:, 2]) > 1.9 * area) & (height > 0.33) & (height < 1.25) & (area > _BOARD_M2)
-        chosen = rng.choice(len(area), _NEAR_TRIED, p=boards * area / (boards @ area))
-        target = (rng.dirichlet((1, 1, 1), _NEAR_TRIED)[..., None] * corners[chosen]).sum(axis=1)
-        bearing, away = rng.uniform(-np.pi, np.pi, _NEAR_TRIED), np.exp(rng.uniform(*np.log(_NEAR_M), _NEAR_TRIED))
-        sight = -np.stack([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(0.15, 0.9, _NEAR_TRIED)], axis=1)
-        eye, length = target - sight, np.linalg.norm(sight, axis=1)
-        seen = surface.cast(np.hstack([eye, sight]).astype(np.float32))["t_hit"]
-        free = (np.abs(seen - 1) * length < 0.03) & (distances(surface.scene, eye) > 0.15) & (eye[:, 2] < 2.1)
-        if np.count_nonzero(free) < count:
-            raise SequenceError(f"house {seed} has no {count} views from near: set fewer --frames or another --seed")
-        yaw = np.arctan2(sight[:, 1], sight[:, 0]) + rng.normal(0, 0.15, _NEAR_TRIED)
-        pitch = np.clip(np.arcsin(sight[:, 2] / length) + rng.uniform(-0.1, 0.55, _NEAR_TRIED), -1.2, 0.2)
-        channels = np.stack([*eye.T, yaw, pitch, rng.normal(0, 0.06, _NEAR_TRIED)])
-        self._views = _posed(channels[:, free][:, :count])
-
-    def poses(self, seconds: FloatArray) -> FloatArray:
-        """As of `Carried`, ``(N, 4, 4)``: those of the nearest frame."""
-        return self._views[np.rint(seconds * self._rate).astype(int).clip(0, len(self._views) - 1)]
-
-
-def _posed(channels: FloatArray) -> FloatArray:
-    """``T_scene_camera`` ``(N, 4, 4)`` of the channels ``(6, N)`` of a motion."""
-    x, y, z, yaw, pitch, roll = channels
-    level, zero = np.cos(pitch), np.zeros_like(x)
-    forward = np.stack([np.cos(yaw) * level, np.sin(yaw) * level, np.sin(pitch)], axis=1)
-    right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
-    upright = se3.make(np.stack([right, np.cross(forward, right), forward], axis=2), np.stack([x, y, z], axis=1))
-    return upright @ se3.from_rotation_vector(np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3)))
+        x, y, z, yaw, pitch, roll = self.at(seconds)
+        level, zero = np.cos(pitch), np.zeros_like(x)
+        forward = np.stack([np.cos(yaw) * level, np.sin(yaw) * level, np.sin(pitch)], axis=1)
+        right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
+        upright = se3.make(np.stack([right, np.cross(forward, right), forward], axis=2), np.stack([x, y, z], axis=1))
+        return upright @ se3.from_rotation_vector(np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3)))
 
 
 def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:
@@ -342,11 +299,7 @@ class SimulatedRooms(SimulatedWorld):
         floor = Floor(self._interior, options.seed)
         seconds = options.frames / options.rate + _AHEAD_S + 1.0
         motions = _PEOPLE if "people" in options.hazards else 1
-        self._carried = (
-            NearViews(self._interior, options.frames, options.rate, options.seed)
-            if options.motion == "near"
-            else Carried(floor, options.motion or "walk", seconds, options.rate, options.seed)
-        )
+        self._carried = Carried(floor, options.motion or "walk", seconds, options.rate, options.seed)
         self._walks = [
             Carried(floor, "walk", seconds, options.rate, options.seed + 1000 * k) for k in range(1, motions)
         ]

@@ -70,7 +70,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 raise DataError(f"data.weights gives '{name}' no weight: name it there, or leave its data set out")
         if self._exact:
             others = ", ".join(dict.fromkeys(recording.name for recording in self._measured))
-            logger.info("%d recordings teach by their exact depth; the others are %s", len(self._exact), others)
+            logger.info("recordings with exact depth: %d; without: %s", len(self._exact), others)
         self._probabilities = chances(self._measured, [len(one) - length + 1 for one in self._measured], weights)
         self._exact_probabilities = chances(self._exact, [1] * len(self._exact), weights)  # however long they are
 

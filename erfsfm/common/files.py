@@ -83,8 +83,7 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 def read_text(path: Path, encoding: str = "utf-8-sig", most: int = MAX_TEXT_BYTES) -> str:
     """A text file with the line ends of any system, and without the byte order mark of some editors."""
-    text = read_bytes(path, most).decode(encoding)
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    return read_bytes(path, most).decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def unfinished_name(path: Path) -> str | None:

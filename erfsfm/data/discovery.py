@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
-from erfsfm.common.readers.images import first_size, has_images, image_folder, list_images, recording_name
+from erfsfm.common.readers.images import first_size, has_images, image_folder, list_images, recording_folder
 from erfsfm.common.readers.kitti import (
     CAM_TO_CAM,
     ODOMETRY_CALIBRATION,
@@ -33,6 +33,7 @@ from erfsfm.data.recordings import Recording, Video, split_at_gaps
 from erfsfm.geometry import Camera
 
 INDOOR_HEIGHT_M = 0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
+_COLOUR = (2, 3)
 logger = logging.getLogger(__name__)
 Number = TypeVar("Number", int, str)
 
@@ -120,7 +121,7 @@ def open_drive(drive: Path) -> list[Recording]:
 
 def _cameras(folders: dict[Number, Path]) -> Iterator[tuple[Number, NumberedFiles, tuple[int, int]]]:
     """Images of the colour cameras, else of the first of the grey ones, with their height and width."""
-    colour = [camera for camera in folders if int(camera) in (2, 3)]
+    colour = [camera for camera in folders if int(camera) in _COLOUR]
     for camera in colour or list(folders)[:1]:
         images = list_images(folders[camera])
         if not images:
@@ -135,7 +136,8 @@ def _own(root: Path) -> list[Recording]:
     home = root.parent if is_video else root
     if not (home / CAMERA_FILE).is_file():
         return []
-    if (written := read_camera_file(home / CAMERA_FILE)).is_distorted:
+    written = read_camera_file(home / CAMERA_FILE)
+    if written.is_distorted:
         raise DataError(f"{home / CAMERA_FILE} describes a distorted camera: undistort the images before training")
     camera = Camera.of(written.pinhole)
     images: list[Path] = []
@@ -147,11 +149,11 @@ def _own(root: Path) -> list[Recording]:
         videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
         return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
     files = by_name(images)
-    whole = Recording(f"folder/{recording_name(home)}", files.paths, camera)
-    maps = (home if recording_name(home) == home.name else home.parent) / "depth"
-    depth = tuple(maps / f"{path.stem}.png" for path in files.paths)
+    recording = recording_folder(home)
+    whole, maps = Recording(f"folder/{recording.name}", files.paths, camera), recording / "depth"
+    depth = tuple(maps / f"{path.stem}.png" for path in files.paths) if maps.is_dir() else ()
     missing = [path.name for path in depth if not path.is_file()]
-    if not missing:  # as a depth camera measures it
+    if depth and not missing:  # as a depth camera measures it
         if written.depth_per_metre is None:
             raise DataError(f"{home / CAMERA_FILE}: add depth_per_metre, the value of one metre in {maps}: 1000 in mm")
         height_m = written.height_or(None) or INDOOR_HEIGHT_M

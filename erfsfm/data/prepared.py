@@ -16,6 +16,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from erfsfm.common.config_tree import Section, dump_yaml, read_model
@@ -99,7 +100,6 @@ def write_prepared(
         progress: told of the stage, what is done, and of how many.
     """
     length, middle = network.sources + 1, network.sources // 2
-    size = network.height, network.width
     snippets = [snippet.recording.part(snippet.first, snippet.first + length) for snippet in held_out]
     recordings = [*training, *snippets]
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
@@ -109,15 +109,16 @@ def write_prepared(
             progress("frames", number, len(recordings))
             folder = unfinished / f"{number:04d}"
             unreadable += _write_images(folder, recording, network)
-            validated = number >= len(training)
-            for index in [middle] if validated else range(len(recording)) if recording.exact else []:
-                depth = recording.true_depth(index) if validated else recording.shrunk_depth(index, *size)
-                if depth is not None:
-                    written = cv2.imencode(".png", np.rint(depth * 256).astype(np.uint16))[1]
-                    write_atomically(_file(folder, "depth", recording.start + index), bytes(written), sync=False)
-            if validated and (T_world_camera := recording.true_poses()) is not None:
-                np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
-            elif not validated and not recording.exact and teacher is not None:
+            if number >= len(training):
+                if (depth := recording.true_depth(middle)) is not None:
+                    _write_depth(folder, recording.start + middle, depth)
+                if (T_world_camera := recording.true_poses()) is not None:
+                    np.savetxt(folder / _POSES, T_world_camera[:, :3].reshape(-1, 12), "%.9g")
+            elif recording.exact:
+                for index in range(len(recording)):
+                    depth = recording.shrunk_depth(index, network.height, network.width)
+                    _write_depth(folder, recording.start + index, depth)
+            elif teacher is not None:
                 _write_labels(teacher.drive(recording), folder / _LABELS, network)
         report_unreadable(unreadable, sum(map(len, recordings)), "images")
         entries = [
@@ -151,6 +152,11 @@ def _write_images(folder: Path, recording: Recording, network: NetworkConfig) ->
     one_by_one = recording.video is not None  # a video is decoded in order
     with ThreadPoolExecutor(1 if one_by_one else os.cpu_count()) as pool:
         return [problem for problem in pool.map(shrink, range(len(recording))) if problem]
+
+
+def _write_depth(folder: Path, frame: int, depth_m: NDArray[np.float32]) -> None:
+    values = np.clip(np.rint(depth_m * 256), 0, 65535).astype(np.uint16)
+    write_atomically(_file(folder, "depth", frame), bytes(cv2.imencode(".png", values)[1]), sync=False)
 
 
 def _write_labels(measured: DriveLabels, folder: Path, network: NetworkConfig) -> None:

@@ -6,7 +6,6 @@ augmentation. A run resumed at step k therefore draws the same samples as an uni
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -28,7 +27,6 @@ from erfsfm.data.split import usable
 from erfsfm.data.window import ArrayCache, Snippet, TeacherStructure, first_readable, load_window, snippet_motion
 from erfsfm.geometry import Camera
 
-logger = logging.getLogger(__name__)
 _VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
 
 
@@ -68,9 +66,6 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         for name in names:
             if weights and not name.startswith(tuple(weights)):
                 raise DataError(f"data.weights gives '{name}' no weight: name it there, or leave its data set out")
-        if self._exact:
-            others = ", ".join(dict.fromkeys(recording.name for recording in self._measured))
-            logger.info("recordings with exact depth: %d; without: %s", len(self._exact), others)
         self._probabilities = chances(self._measured, [len(one) - length + 1 for one in self._measured], weights)
         self._exact_probabilities = chances(self._exact, [1] * len(self._exact), weights)  # however long they are
 
@@ -158,8 +153,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         self._network = config.network
         self._cache = ArrayCache(config.data.cache_mb, (self._network.height, self._network.width, 3), np.uint8)
         length = config.network.sources + 1
-        kept = usable(recordings, length)
-        windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
+        windows = [Snippet(r, first) for r in usable(recordings, length) for first in range(len(r) - length + 1)]
         chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
         self.snippets, reasons = [], []
         for snippet in (windows[int(i)] for i in chosen.round()):
@@ -177,8 +171,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         snippet, network = self.snippets[item], self._network
         recording = snippet.recording
         images, depth = self._read(snippet)
-        camera = recording.camera.resized(network.width, network.height, network.fidelity)
-        sample = as_tensors(images, camera.K)
+        sample = as_tensors(images, recording.camera.resized(network.width, network.height, network.fidelity).K)
         if depth is not None:
             sample["depth"] = torch.from_numpy(depth)
         T_world_camera = recording.true_poses()

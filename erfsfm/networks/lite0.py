@@ -163,10 +163,8 @@ class Lite0DepthNet(DisparityNetwork):
     def __init__(self, variant: Variant = "plain", width: float = 1.0) -> None:
         super().__init__()
         channels = [scaled(count, width) for count in _DECODER_CHANNELS]
-        deformable = variant == "dfc"
-        wide = Layer(3, 1, deformable=deformable)
-        context = ConvBlock(CHANNELS, channels[0], wide)
-        self.encoder = Lite0Encoder(self.input_channels, context)
+        wide = Layer(3, 1, deformable=variant == "dfc")
+        self.encoder = Lite0Encoder(self.input_channels, ConvBlock(CHANNELS, channels[0], wide))
         self.reductions, self.fusions = nn.ModuleList(), nn.ModuleList()
         for inside, outside, skip in zip(channels, channels[1:], reversed(SKIP_CHANNELS)):  # 1/16 to 1/2
             self.reductions.append(ConvBlock(inside, outside, Layer(3, 1)))

@@ -314,13 +314,15 @@ def measured_views(
         folder: of the measurements.
         progress: told of the stage, what is done, and of how many.
     """
-    _, measured = by_label(recordings, config)
+    exact, measured = by_label(recordings, config)
+    if exact:
+        others = ", ".join(dict.fromkeys(recording.name for recording in measured))
+        logger.info("recordings with exact depth: %d; without: %s", len(exact), others)
     if config.teacher.views != "many":
         return None
     size = (config.network.height, config.network.width)
     with_depth = config.training.networks != "pose"
-    cache_mb = labels_mb(config.data)
     learned = partial(learned_inverse_depth, config.teacher.slam_weights)
-    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, with_depth, learned)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride, labels_mb(config.data), with_depth, learned)
     teacher.prepare(measured, config.network.sources, config.teacher.slam_weights, progress)
     return teacher

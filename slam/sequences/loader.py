@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.common.readers.images import image_folder, list_images, recording_name
+from erfsfm.common.readers.images import image_folder, list_images, recording_folder
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, clip_name, list_videos, video_name
 from slam.geometry.se3 import FloatArray
@@ -72,7 +72,7 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     places = (where, folder, folder.absolute().parent)
     camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
     stamps = _times_of_images([place / name for place in (where, folder) for name in TIMES], files, camera.fps)
-    name = recording_name(folder)
+    name = recording_folder(folder).name
     return RecordedSequence(name, stored, camera, stamps, (Source(f"folder/{name}"),))
 
 

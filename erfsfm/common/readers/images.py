@@ -63,10 +63,10 @@ def image_folder(folder: Path) -> Path | None:
     return found[0] if found else None
 
 
-def recording_name(folder: Path) -> str:
-    """The folder's name, or its parent's where the folder is only called ``images`` or the like."""
+def recording_folder(folder: Path) -> Path:
+    """The folder that names a recording: this one, or its parent where it is only called ``images`` or the like."""
     folder = folder.absolute()
-    return folder.parent.name if folder.name in IMAGE_FOLDERS and folder.parent.name else folder.name
+    return folder.parent if folder.name in IMAGE_FOLDERS and folder.parent.name else folder
 
 
 def is_image(path: Path) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import Image, recording_name
+from erfsfm.common.readers.images import Image, recording_folder
 
 logger = logging.getLogger(__name__)
 
@@ -143,9 +143,9 @@ def list_videos(folder: Path) -> list[Path]:
 
 
 def video_name(video: Path) -> str:
-    """The name of the folder, as `recording_name`; of one of several videos its own name, too: ``my_drive/clip2``."""
+    """The name of the folder, as `recording_folder`; of one of several videos its own name, too: ``my_drive/clip2``."""
     folder = video.absolute().parent
-    name = recording_name(folder)
+    name = recording_folder(folder).name
     return f"{name}/{clip_name(video)}" if len(list_videos(folder)) > 1 else name
 
 

@@ -1,12 +1,8 @@
 """A drive completed after its last frame: gaps interpolated, rotations smoothed, segments found.
 
-Frames without a measurement follow the constant-velocity model, with wide sigmas.
-
-Rotations of single steps are corrected by relative rotations across several steps, and directions with them. The
-tracking error of a corner is the same over two steps as over one, and a drift of its window is a bias of every step.
-Measured between frames two steps apart, the same error enters half as often. Corners that turn the camera too far move
-it to the other side: the direction of a step is corrected by as much as its covariance with the rotation says
-(``docs/design/visual-front-end.md``).
+Frames without a measurement follow the constant-velocity model, with wide sigmas. Rotations of single steps are
+corrected by relative rotations across several steps, where the tracking error of a corner enters half as often, and
+directions by as much as their covariance with the rotation says (``docs/design/visual-front-end.md``).
 """
 
 from __future__ import annotations

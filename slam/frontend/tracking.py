@@ -1,12 +1,8 @@
 """Sparse optical flow: Shi-Tomasi corners, pyramidal Lucas-Kanade from a predicted motion, and back again as a check.
 
-With a flow predicted from learned depth and the last motion, corners are tracked in the image warped back by it. Those
-that are not found there and back, as on other cars, are tracked in the image as it is.
-
-From a moving car a window on the road is stretched by a fifth from frame to frame, one on a near wall by a tenth.
-Lucas-Kanade shifts windows without stretching them. It then locks onto whatever part of a window has most texture:
-single corners have errors of half a pixel, and those on the road all upwards, which resembles a pitching camera
-(``docs/design/visual-front-end.md``). Warping the later image back by the predicted flow removes the stretch.
+With a flow predicted from learned depth and the last motion, corners are tracked in the image warped back by it, for
+Lucas-Kanade shifts windows without stretching them (``docs/design/visual-front-end.md``). Those that are not found
+there and back, as on other cars, are tracked in the image as it is.
 """
 
 from __future__ import annotations

@@ -1,18 +1,12 @@
 """The motion between two views from corners, learned depth and the motion prior of the drive.
 
-Corners alone are ambiguous: where most of them lie on a car that turns with the camera, its corners and distant ones
-lie on the epipolar lines of a motion that neither made (``docs/design/visual-front-end.md``). Two further
-measurements resolve this: the shift of each corner along its epipolar line, which learned depth predicts too; and the
-usual direction of motion. Residuals of corners are across and along these lines.
+Corners alone are ambiguous (``docs/design/visual-front-end.md``). Two further measurements resolve this: the shift of
+each corner along its epipolar line, which learned depth predicts too; and the usual direction of motion. Residuals of
+corners are across and along these lines. Where many corners were outliers recently, the others are weighted down.
 
-A car ahead stays at one place of the image for minutes. Some of its corners fit the camera's motion by chance and bias
-it, but most do not: where many corners were outliers recently, the others are weighted down.
-
-A car that drives along with the camera keeps its corners on their epipolar lines, so geometry alone takes it for a part
-of the scene, farther or nearer than it is; learned depth knows better. But learned depth errs too, over half of the
-image at times, and must not cast out the scene itself. So it is believed only about a region as an object has it:
-connected, of one motion, and without the majority of the road; and about all such regions together only where they do
-not hold the majority of the image's parallax.
+A car that drives along keeps its corners on their epipolar lines. Learned depth is believed against them only about a
+region as an object has it: connected, of one motion, and without the majority of the road; and about all such regions
+together only where they do not hold the majority of the image's parallax.
 """
 
 from __future__ import annotations
